@@ -1,0 +1,3 @@
+"""accelcal: calibrate three-axis accelerometers without a turntable."""
+
+__version__ = "0.1.0"

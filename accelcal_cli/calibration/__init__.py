@@ -1,0 +1,1 @@
+"""The calibration: the Loetters problem, the pipeline, quality, planner and result."""

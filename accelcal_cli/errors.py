@@ -1,0 +1,38 @@
+"""The errors a user can cause, each with one clear message.
+
+A message says what was wrong, where (file, line, column, key), and what was expected.
+The command line prints it and exits with 2; the library raises it.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class AccelcalError(Exception):
+    """Base of every error that is the input's fault, never the program's."""
+
+
+class UsageError(AccelcalError):
+    """An option or argument outside what it may be."""
+
+
+class ConfigError(AccelcalError):
+    """A configuration file or mapping that cannot be used."""
+
+
+class DataError(AccelcalError):
+    """Readings that cannot be used: unreadable, malformed or without information."""
+
+
+class OutputError(AccelcalError):
+    """A result that could not be written."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return `` (did you mean "..."?)`` for the nearest known name, or nothing when none is near."""
+    choices = list(known)
+    folded = {name.lower(): name for name in choices}
+    near = difflib.get_close_matches(word.lower(), folded, n=1, cutoff=0.5)
+    return f' (did you mean "{folded[near[0]]}"?)' if near else ""

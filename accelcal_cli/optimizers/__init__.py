@@ -1,0 +1,1 @@
+"""The optimizers: one algorithm a file, and the one loop that runs them."""

@@ -1,0 +1,1 @@
+"""Renderers: a Table becomes terminal text, CSV or JSON. Nothing here computes."""

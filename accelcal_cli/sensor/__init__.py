@@ -1,0 +1,1 @@
+"""The sensor: error model, units, gravity, poses, readings and simulation."""
