@@ -1,0 +1,122 @@
+"""What every optimizer is: a frozen dataclass of settings with two pure methods, `init` and `step`.
+
+Shapes: R runs, P points of the population, D dimensions. Arrays of shape (R, P, D) keep the population axis
+contiguous in memory (see `streams`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.problem import Problem
+from accelcal_cli.registry import Registry, check, setting
+from accelcal_cli.streams import Float, Int, Streams
+
+RUNNING, CONVERGED, FAILED = 0, 1, 2
+"""Values of `State.status`: go on, nothing left to gain, numerical failure."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What an optimizer carries from step to step; each algorithm adds its own fields.
+
+    Attributes:
+        x: the population, shape (R, P, D).
+        fx: its cost, shape (R, P).
+        status: None, or RUNNING, CONVERGED or FAILED for each run, shape (R,).
+    """
+
+    x: Float
+    fx: Float
+    status: NDArray[np.int8] | None = dataclasses.field(default=None, kw_only=True)
+
+
+S = TypeVar("S", bound=State)
+
+
+def take(state: S, index: Int) -> S:
+    """Return the state of the runs at `index`; every array field has the runs as its first axis."""
+    parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
+    return dataclasses.replace(state, **{k: v[index] for k, v in parts.items() if isinstance(v, np.ndarray)})
+
+
+@dataclass(frozen=True)
+class Optimizer(ABC):
+    """Base of all optimizers; the fields of a subclass are its YAML keys."""
+
+    name: ClassVar[str]
+    family: ClassVar[str]
+    paper: ClassVar[str]
+    """Key of docs/bibliography.md."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """What the problem must offer: "residuals", "closed_form"."""
+
+    population: int = setting(100, "points that are evaluated together (N)", low=4, high=1_000_000)
+    iterations: int = setting(500, "steps at most (k_max)", low=1, high=100_000_000)
+
+    def __post_init__(self) -> None:
+        """Refuse a setting outside its range."""
+        check(self)
+
+    def suits(self, problem: Problem) -> bool:
+        """Whether `problem` offers what this optimizer needs."""
+        return all(getattr(problem, f"has_{need}") for need in self.needs)
+
+    @abstractmethod
+    def init(self, problem: Problem, x: Float, rng: Streams) -> Any:
+        """Return the first State from a starting population x, shape (R, P, D)."""
+
+    @abstractmethod
+    def step(self, problem: Problem, state: Any, rng: Streams) -> Any:
+        """Return the State after one iteration of all R runs."""
+
+
+OPTIMIZERS: Registry[Optimizer] = Registry("accelcal_cli.optimizers", "optimizer")
+
+
+def gather(x: Float, index: Int) -> Float:
+    """Return rows of each run's population: x (R, P, D) at index (R, Q), shape (R, Q, D)."""
+    flat = x.transpose(0, 2, 1)
+    out = np.empty((*flat.shape[:2], index.shape[1]))
+    for source, rows, target in zip(flat, index, out, strict=True):
+        # mode "clip" spares numpy a buffer; the indices are in range by construction.
+        source.take(rows, axis=1, out=target, mode="clip")
+    return out.transpose(0, 2, 1)
+
+
+def at(fx: Float, column: Int) -> Float:
+    """Return one entry a run: fx (R, P) at column (R,), shape (R,)."""
+    return fx[np.arange(len(fx)), column]
+
+
+def best_of(x: Float, fx: Float) -> tuple[Float, Float]:
+    """Return each run's best point, shape (R, 1, D), and its cost, shape (R,)."""
+    column = fx.argmin(axis=1)
+    rows = np.arange(len(fx))
+    return x[rows, column][:, None, :], fx[rows, column]
+
+
+def partners(u: Float, population: int) -> Int:
+    """Return two distinct partners, neither of them itself, for every individual.
+
+    Args:
+        u: uniform numbers, shape (R, population, 2).
+        population: P >= 3.
+
+    Returns:
+        Indices, shape (R, 2 P): first the P first partners, then the P second ones. Drawn without rejection:
+        the first among the P - 1 others, the second among the P - 2 that remain.
+    """
+    own = np.arange(population)
+    first = (u[..., 0] * (population - 1)).astype(np.intp)
+    first += first >= own
+    second = (u[..., 1] * (population - 2)).astype(np.intp)
+    second += second >= np.minimum(first, own)
+    second += second >= np.maximum(first, own)
+    return np.concatenate((first, second), axis=1)

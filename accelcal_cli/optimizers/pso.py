@@ -1,0 +1,88 @@
+"""Particle swarm optimization with inertia weight, global best, clipped velocity and position.
+
+Kennedy and Eberhart 1995; the inertia weight is Shi and Eberhart's; w = 0.7298 with c1 = c2 = 1.49618 is the
+constriction of Clerc and Kennedy [clerc2002]. The DPSO paper runs it with c1 = c2 = 2 and the same w, which
+is beyond the order-2 stability bound c1 + c2 < 24 (1 - w^2) / (7 - 5 w) = 3.35 and stalls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of
+from accelcal_cli.problem import Problem
+from accelcal_cli.registry import setting
+from accelcal_cli.streams import Float, Streams
+
+
+@dataclass(frozen=True)
+class SwarmState(State):
+    """A swarm: x and fx are the positions and their costs."""
+
+    velocity: Float  # (R, P, D)
+    memory: Float  # pbest, (R, P, D)
+    memory_cost: Float  # (R, P)
+    leader: Float  # gbest, (R, 1, D)
+
+
+def velocity(
+    x: Float, v: Float, memory: Float, leader: Float, r: Float, inertia: float, c1: float, c2: float
+) -> Float:
+    """Return the new velocity, [dpso2014] eq. 1, where c1 goes with the global best.
+
+    All of shape (R, P, D), leader (R, 1, D), r uniform of shape (R, P, 2 D).
+    """
+    dimensions = x.shape[2]
+    pull = leader - x
+    pull *= r[..., :dimensions]
+    pull *= c1
+    own = memory - x
+    own *= r[..., dimensions:]
+    own *= c2
+    pull += own
+    own = inertia * v
+    own += pull
+    return own
+
+
+def remember(memory: Float, memory_cost: Float, x: Float, fx: Float) -> tuple[Float, Float]:
+    """Return the personal bests after the swarm has been at x with cost fx."""
+    better = fx < memory_cost
+    return np.where(better[..., None], x, memory), np.where(better, fx, memory_cost)
+
+
+@OPTIMIZERS.register("pso")
+@dataclass(frozen=True)
+class ParticleSwarm(Optimizer):
+    """Particle swarm optimization."""
+
+    family = "swarm"
+    paper = "clerc2002"
+
+    inertia: float = setting(0.7298, "inertia weight (w)", low=0, high=2)
+    social: float = setting(1.49618, "pull towards the global best (c1)", low=0, high=10)
+    cognitive: float = setting(1.49618, "pull towards the own best (c2)", low=0, high=10)
+    speed: float = setting(0.2, "velocity limit as a part of the half box (v_max)", above=0, high=100)
+
+    def init(self, problem: Problem, x: Float, rng: Streams) -> SwarmState:
+        """Start at rest: v = 0."""
+        fx = problem.cost(x)
+        return SwarmState(x, fx, np.zeros_like(x), x, fx, best_of(x, fx)[0])
+
+    def step(self, problem: Problem, state: SwarmState, rng: Streams) -> SwarmState:
+        """Move the swarm once."""
+        x = state.x
+        r = rng.uniform(x.shape[1], 2 * x.shape[2])
+        v = velocity(x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive)
+        limit = 0.5 * self.speed * (problem.upper - problem.lower)
+        np.clip(v, -limit, limit, out=v)
+        x = x + v  # [dpso2014] eq. 2
+        np.clip(x, problem.lower, problem.upper, out=x)
+        fx = problem.cost(x)
+        memory, memory_cost = remember(state.memory, state.memory_cost, x, fx)
+        leader = best_of(memory, memory_cost)[0]
+        return replace(
+            state, x=x, fx=fx, velocity=v, memory=memory, memory_cost=memory_cost, leader=leader
+        )

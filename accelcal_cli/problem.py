@@ -1,0 +1,121 @@
+"""What an optimizer minimises: a box, a cost, and where they exist residuals and their Jacobian.
+
+Shapes everywhere: R runs, P points of a population, D dimensions, M residuals.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.streams import Float, Int
+
+
+class Problem(ABC):
+    """A cost over a box.
+
+    Attributes:
+        name: for tables.
+        lower, upper: the box, shape (D,).
+        minimum: the known least cost, or None.
+        has_residuals: whether `residuals` and `jacobian` exist, with cost = sum of squared residuals.
+        has_closed_form: whether `closed_form` exists.
+    """
+
+    name: str
+    lower: Float
+    upper: Float
+    minimum: float | None = None
+    has_residuals: bool = False
+    has_closed_form: bool = False
+
+    @property
+    def dimensions(self) -> int:
+        """D, the number of unknowns."""
+        return int(self.lower.size)
+
+    @abstractmethod
+    def cost(self, x: Float) -> Float:
+        """Return the cost, shape (R, P), at x, shape (R, P, D)."""
+
+    def residuals(self, x: Float) -> Float:
+        """Return residuals whose squares sum to the cost, shape (R, P, M), at x, shape (R, P, D)."""
+        raise NotImplementedError(f"{self.name} has no residuals")
+
+    def jacobian(self, x: Float) -> Float:
+        """Return d residual / d x, shape (R, P, M, D), at x, shape (R, P, D)."""
+        raise NotImplementedError(f"{self.name} has no Jacobian")
+
+    def closed_form(self) -> Float:
+        """Return the solution that needs no search, shape (R, D) or (1, D); NaN where there is none."""
+        raise NotImplementedError(f"{self.name} has no closed form")
+
+    def take(self, index: Int) -> Problem:  # noqa: ARG002
+        """Return the problem of the runs at `index`; itself when all runs share one problem."""
+        return self
+
+
+class Counted(Problem):
+    """A problem that counts its evaluations and remembers the best point of every run.
+
+    Every point whose cost or residuals are asked for is one evaluation, and so is every Jacobian: algorithms
+    never report their own counts. A NaN cost becomes +inf, so that no comparison can choose it.
+    """
+
+    def __init__(self, problem: Problem, runs: int) -> None:
+        """Wrap `problem` for `runs` runs (R)."""
+        self.problem = problem
+        self.name, self.lower, self.upper = problem.name, problem.lower, problem.upper
+        self.minimum = problem.minimum
+        self.has_residuals, self.has_closed_form = problem.has_residuals, problem.has_closed_form
+        self.evaluations: NDArray[np.int64] = np.zeros(runs, dtype=np.int64)
+        self.best_x: Float = np.full((runs, problem.dimensions), np.nan)
+        self.best_cost: Float = np.full(runs, np.inf)
+        self._rows = np.arange(runs)
+
+    def cost(self, x: Float) -> Float:
+        """Return the cost with NaN as +inf; see `Problem.cost`."""
+        fx = self.problem.cost(x)
+        if not np.isfinite(np.add.reduce(fx, axis=None)):
+            fx = np.where(np.isnan(fx), np.inf, fx)
+        self._note(x, fx)
+        return fx
+
+    def residuals(self, x: Float) -> Float:
+        """Return the residuals; their squares are noted as costs."""
+        r = self.problem.residuals(x)
+        fx = np.einsum("rpm,rpm->rp", r, r)
+        self._note(x, np.where(np.isnan(fx), np.inf, fx))
+        return r
+
+    def jacobian(self, x: Float) -> Float:
+        """Return the Jacobian, counted as one evaluation a point."""
+        self.evaluations += x.shape[1]
+        return self.problem.jacobian(x)
+
+    def closed_form(self) -> Float:
+        """Return the closed form, which evaluates nothing."""
+        return self.problem.closed_form()
+
+    def take(self, index: Int) -> Counted:
+        """Return the counted problem of the runs at `index`, with their counts and best points."""
+        part = Counted(self.problem.take(index), len(index))
+        part.evaluations = self.evaluations[index]
+        part.best_x, part.best_cost = self.best_x[index], self.best_cost[index]
+        return part
+
+    def _note(self, x: Float, fx: Float) -> None:
+        self.evaluations += x.shape[1]
+        column = fx.argmin(axis=1)
+        least = fx[self._rows, column]
+        better = least < self.best_cost
+        if better.any():
+            self.best_cost = np.where(better, least, self.best_cost)
+            self.best_x = np.where(better[:, None], x[self._rows, column], self.best_x)
+
+    def __getattr__(self, name: str) -> Any:
+        """Look up anything else (units of a coordinate, ...) on the wrapped problem."""
+        return getattr(self.problem, name)

@@ -1,0 +1,57 @@
+"""One random stream per run, so that a run's bits do not depend on its company.
+
+Run 13 alone, run 13 in a batch of 20 and run 13 on another worker draw the same numbers: every run owns a
+generator seeded from (seed, run), and a batched draw fills each run's slice from that run's generator.
+
+Arrays come out as (R, P, D) with the population axis contiguous in memory: operations over a population of
+100 then run along 100 neighbours instead of along 12 coordinates, which is two to three times as fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.random import SFC64, Generator, SeedSequence
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.intp]
+
+
+class Streams:
+    """R independent generators, one a run.
+
+    Args:
+        seed: the study's seed, a non-negative integer.
+        runs: the numbers of the runs; run r draws the same whatever the others are.
+        purpose: separates draws of different use (search, noise, ...) under one seed.
+    """
+
+    def __init__(self, seed: int, runs: Iterable[int], purpose: int = 0) -> None:
+        """Seed one generator for every run from (seed, purpose, run)."""
+        self.generators = [Generator(SFC64(SeedSequence(seed, spawn_key=(purpose, run)))) for run in runs]
+
+    def __len__(self) -> int:
+        """R, the number of runs."""
+        return len(self.generators)
+
+    def uniform(self, rows: int, columns: int) -> Float:
+        """Return U[0, 1) numbers, shape (R, rows, columns), population-contiguous."""
+        out = np.empty((len(self.generators), columns, rows))
+        for generator, part in zip(self.generators, out, strict=True):
+            generator.random(out=part)
+        return out.transpose(0, 2, 1)
+
+    def normal(self, rows: int, columns: int) -> Float:
+        """Return N(0, 1) numbers, shape (R, rows, columns), population-contiguous."""
+        out = np.empty((len(self.generators), columns, rows))
+        for generator, part in zip(self.generators, out, strict=True):
+            generator.standard_normal(out=part)
+        return out.transpose(0, 2, 1)
+
+    def take(self, index: Int) -> Streams:
+        """Return the streams of the runs at `index`, going on where they stand."""
+        chosen = Streams(0, ())
+        chosen.generators = [self.generators[i] for i in index]
+        return chosen

@@ -1,0 +1,54 @@
+"""A table of results: named columns with units, and rows. The one thing every renderer draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a Table.
+
+    Attributes:
+        name: heading.
+        unit: unit shown under or behind the heading; empty when it has none.
+        format: format specification of a numeric cell, as in `format(value, spec)`.
+        key: name of the column in machine-readable output; the heading when not given.
+    """
+
+    name: str
+    unit: str = ""
+    format: str = ""
+    key: str = ""
+
+    def text(self, value: Any) -> str:
+        """Return the cell as a person reads it; a missing value is a dash."""
+        if value is None:
+            return "-"
+        if isinstance(value, float) and value != value:
+            return "-"
+        return format(value, "" if isinstance(value, str) else self.format)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns and rows with a title; `notes` are sentences under it.
+
+    Attributes:
+        title: what the table shows.
+        columns: its columns, in order.
+        rows: one sequence of raw values a row, as long as `columns`.
+        notes: plain sentences that belong under the table.
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Sequence[Any], ...]
+    notes: tuple[str, ...] = ()
+
+    def records(self) -> list[Mapping[str, Any]]:
+        """Return the rows as mappings from column key to raw value."""
+        keys = [column.key or column.name for column in self.columns]
+        return [dict(zip(keys, row, strict=True)) for row in self.rows]
