@@ -124,7 +124,9 @@ def _sequence(value: Any, arguments: tuple[Any, ...], label: str) -> tuple[Any, 
         arguments = (arguments[0],) * len(value)
     if len(value) != len(arguments):
         raise ConfigError(f"{label}: expected {len(arguments)} values, not {len(value)}")
-    return tuple(convert(v, a, f"{label}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True)))
+    return tuple(
+        convert(v, a, f"{label}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True))
+    )
 
 
 class Registry(Generic[T]):

@@ -47,7 +47,8 @@ class DifferentialEvolution(Optimizer):
         "rand/1", "base vector: rand/1 of Storn and Price, current/1 as the DPSO paper prints, best/1"
     )
     crossover_keeps: Literal["parent", "mutant"] = setting(
-        "parent", "what the crossover probability keeps: parent as in the DPSO paper, mutant as in Storn and Price"
+        "parent",
+        "what the crossover probability keeps: parent as in the DPSO paper, mutant as in Storn and Price",
     )
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> State:
@@ -68,9 +69,7 @@ class DifferentialEvolution(Optimizer):
         np.copyto(mutant, x, where=keeps_parent(u[..., 4:], share, u[..., 3]))
         trial_cost = problem.cost(mutant)
         better = trial_cost < fx  # [dpso2014] eq. 6
-        return replace(
-            state, x=np.where(better[..., None], mutant, x), fx=np.where(better, trial_cost, fx)
-        )
+        return replace(state, x=np.where(better[..., None], mutant, x), fx=np.where(better, trial_cost, fx))
 
     def _base(self, x: Float, fx: Float, u: Float) -> Float:
         if self.strategy == "best/1":

@@ -132,7 +132,12 @@ class _Loop:
             ended = self._ended(counted, state, alive)
             if ended.any():
                 keep = np.flatnonzero(~ended)
-                alive, counted, state, rng = alive[keep], counted.take(keep), take(state, keep), rng.take(keep)
+                alive, counted, state, rng = (
+                    alive[keep],
+                    counted.take(keep),
+                    take(state, keep),
+                    rng.take(keep),
+                )
                 if not len(alive):
                     break
             state = self.optimizer.step(counted, state, rng)
@@ -164,7 +169,9 @@ class _Loop:
             ended |= which
         return ended
 
-    def _outcome(self, numbers: NDArray[np.int64], costs: list[Float], counts: list[NDArray[np.int64]]) -> Run:
+    def _outcome(
+        self, numbers: NDArray[np.int64], costs: list[Float], counts: list[NDArray[np.int64]]
+    ) -> Run:
         status = tuple(
             s if np.isfinite(c) else Status.FAILED for s, c in zip(self.status, self.best_cost, strict=True)
         )

@@ -75,7 +75,9 @@ class ParticleSwarm(Optimizer):
         """Move the swarm once."""
         x = state.x
         r = rng.uniform(x.shape[1], 2 * x.shape[2])
-        v = velocity(x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive)
+        v = velocity(
+            x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive
+        )
         limit = 0.5 * self.speed * (problem.upper - problem.lower)
         np.clip(v, -limit, limit, out=v)
         x = x + v  # [dpso2014] eq. 2
@@ -83,6 +85,4 @@ class ParticleSwarm(Optimizer):
         fx = problem.cost(x)
         memory, memory_cost = remember(state.memory, state.memory_cost, x, fx)
         leader = best_of(memory, memory_cost)[0]
-        return replace(
-            state, x=x, fx=fx, velocity=v, memory=memory, memory_cost=memory_cost, leader=leader
-        )
+        return replace(state, x=x, fx=fx, velocity=v, memory=memory, memory_cost=memory_cost, leader=leader)

@@ -1,0 +1,81 @@
+"""The linear error model of a three-axis accelerometer and the gauges of its matrix.
+
+    N = K_a f + D_a                    [dpso2014] eq. 10 without noise
+    f = K_A N - f_0,  K_A = K_a^-1, f_0 = K_A D_a      eq. 11
+
+N is the output (pulse/s, counts, any linear output), f the specific force in the body frame (m/s^2).
+A rotation of the body frame changes K_a to K_a R^T and leaves every |f| as it was: readings without known
+attitudes fix K_a only up to that rotation, and a gauge is the convention that chooses it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.linalg import cholesky, eigh, inv
+
+from accelcal_cli.streams import Float
+
+Gauge = Literal["lower", "upper", "symmetric", "full"]
+GAUGES: tuple[str, ...] = get_args(Gauge)
+
+
+def to_gauge(K: Float, gauge: str) -> Float:
+    """Return K_a in a gauge: the K R^T, R a rotation, that has the gauge's form.
+
+    Definition:
+        lower: Cholesky factor of K K^T, positive diagonal: body x along the x sensor axis, body y in the plane
+        of the x and y sensor axes. upper: the same with the axes in reverse order. symmetric: (K K^T)^(1/2),
+        the polar factor, closest to no rotation. full: as it is.
+
+    Args:
+        K: shape (..., 3, 3), output units per m/s^2.
+        gauge: one of GAUGES.
+    """
+    if gauge == "full":
+        return K
+    product = K @ K.swapaxes(-1, -2)
+    if gauge == "lower":
+        return cholesky(product)
+    if gauge == "upper":
+        return cholesky(product[..., ::-1, ::-1])[..., ::-1, ::-1]
+    values, vectors = eigh(product)
+    root: Float = (vectors * np.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2)
+    return root
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Scale factors, misalignments and bias of one accelerometer.
+
+    Attributes:
+        K: K_a, shape (3, 3), output units per m/s^2; diagonal = scale factors, off-diagonal = misalignment.
+        D: D_a, bias, shape (3,), output units.
+    """
+
+    K: Float
+    D: Float
+
+    @property
+    def K_A(self) -> Float:  # noqa: N802
+        """Inverse matrix. Definition: K_a^-1. Units: m/s^2 per output unit. Shape (3, 3)."""
+        return inv(self.K)
+
+    @property
+    def f_0(self) -> Float:
+        """Bias as specific force. Definition: K_a^-1 D_a. Units: m/s^2. Shape (3,)."""
+        return self.K_A @ self.D
+
+    def output(self, f: Float) -> Float:
+        """Return the output N, shape (..., 3), at specific force f, shape (..., 3) in m/s^2."""
+        return f @ self.K.T + self.D
+
+    def specific_force(self, N: Float) -> Float:
+        """Return the specific force in m/s^2, shape (..., 3), of outputs N, shape (..., 3)."""
+        return (N - self.D) @ self.K_A.T
+
+    def in_gauge(self, gauge: str) -> ErrorModel:
+        """Return the same sensor seen from the body frame of another gauge. The bias D_a does not change."""
+        return ErrorModel(to_gauge(self.K, gauge), self.D)
