@@ -134,7 +134,7 @@ def describe(direction: Float) -> str:
         return f"{name[0]} up"
     if math.degrees(math.asin(min(1.0, size[2]))) < 0.5:
         return f"{name[0]} up, tilted {tilt:.0f} degrees towards {name[1]}"
-    if abs(size[1] - size[2]) < 0.01:
-        return f"{name[0]} up, tilted {tilt:.0f} degrees towards the edge between {name[1]} and {name[2]}"
+    if size[0] - size[2] < 0.01:
+        return f"corner between {name[0]}, {name[1]} and {name[2]} up"
     turn = math.degrees(math.atan2(size[2], size[1]))
     return f"{name[0]} up, tilted {tilt:.0f} degrees towards {name[1]} turned {turn:.0f} degrees to {name[2]}"

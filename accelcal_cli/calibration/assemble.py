@@ -1,0 +1,214 @@
+"""From a solution to the record: uncertainty, verdict, residuals, notes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from accelcal_cli import __version__
+from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.nominal import Start
+from accelcal_cli.calibration.planner import fixture_directions, next_poses
+from accelcal_cli.calibration.quality import Observability
+from accelcal_cli.calibration.residuals import Fit, examine, outliers, rms_error
+from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.robust import robust_variance
+from accelcal_cli.calibration.search import Solution, lower_problem, model_at
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.poses import describe
+from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.streams import Float
+
+COMFORTABLE = 5.0
+"""Suggested poses bring every dilution of precision to this: half of what counts as weak."""
+
+MOST_SUGGESTIONS = 8
+EDGE = 1e-6
+"""A parameter within this part of a half-width from the wall of its box is at the edge."""
+
+CURVE_POINTS = 120
+"""Points kept of the convergence curve."""
+
+
+def assemble(
+    readings: Readings, settings: Settings, start: Start, solution: Solution, weights: Float | None
+) -> Calibration:
+    """Return the calibration record of a solution."""
+    g = settings.g
+    found = model_at(solution.problem, solution.x)
+    shown = found.in_gauge(settings.gauge)
+    nine, point = lower_problem(solution.problem, found)
+    low = ErrorModel(*(a[0] for a in nine.parameters(point)))
+    information = quality.information(nine, point)[0]
+    seen = Observability.of(information, readings.poses)
+    freedom = readings.poses - 9
+    fit = examine(readings, low, g, seen.cofactor, weights, freedom)
+    variance = _variance(readings, settings, solution, low, weights, freedom)
+    covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
+    sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
+    suggestions = _suggest(information, seen)
+    before, before_model = _before(start, settings)
+    ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
+    return Calibration(
+        K_a=shown.K,
+        D_a=shown.D,
+        K_A=shown.K_A,
+        f_0=shown.f_0,
+        gauge=settings.gauge,
+        sigma=Sigma(sigma_K, sigma_D),
+        dop=_dop(seen),
+        verdict=seen.verdict,
+        reasons=quality.in_words(seen, suggestions),
+        suggestions=suggestions,
+        cost_search=float(solution.search.cost[solution.best]),
+        cost=solution.cost,
+        rms=fit.rms,
+        rms_before=rms_error(readings, before_model, g),
+        before=before,
+        s=float(np.sqrt(variance)),
+        freedom=freedom,
+        noise_ratio=ratio,
+        noise_chance=chance,
+        covariance=covariance,
+        nominal_scale=np.diagonal(before_model.K).copy(),
+        poses=readings.poses,
+        evaluations=solution.evaluations,
+        runs=settings.runs,
+        runs_agreeing=solution.agreeing,
+        poses_fit=_pose_fits(readings, fit),
+        outliers=tuple(int(j) for j in outliers(fit.poses, readings.poses, freedom)),
+        convergence=_curve(solution),
+        optimizer=settings.optimizer,
+        settings=_settings_record(settings, start),
+        g=g,
+        data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
+        notes=(*readings.notes, *_notes(solution, start, settings)),
+        version=__version__,
+    )
+
+
+def _variance(
+    readings: Readings,
+    settings: Settings,
+    solution: Solution,
+    low: ErrorModel,
+    weights: Float | None,
+    freedom: int,
+) -> float:
+    """Return s^2 in (m/s^2)^2: sum w e^2 / (J - 9); NaN without degrees of freedom."""
+    if freedom < 1:
+        return float("nan")
+    if solution.noise:
+        return robust_variance(readings, low, settings.g, solution.noise, settings.robust, weights)
+    return solution.cost / (4.0 * settings.g**2) / freedom  # L = sum (2 g e)^2
+
+
+def _suggest(information: Float, seen: Observability) -> tuple[str, ...]:
+    if seen.verdict == "good":
+        return ()
+    candidates = fixture_directions()
+    chosen = next_poses(information, candidates, MOST_SUGGESTIONS, COMFORTABLE)
+    return tuple(describe(candidates[i]) for i in chosen)
+
+
+def _before(start: Start, settings: Settings) -> tuple[str, ErrorModel]:
+    """Return what the readings are taken for before calibration, in words and as a model.
+
+    A stated nominal sensor; else, for readings that are specific force already, themselves; else one scale
+    factor for all axes and the bias in the middle, which is what a user without calibration could do.
+    """
+    centre = start.box.centre[0]
+    if settings.nominal is not None:
+        return "the stated nominal sensor", ErrorModel(
+            np.diag(settings.nominal.scale), np.array(settings.nominal.bias)
+        )
+    scale = float(centre[:3].mean())
+    if 0.8 < scale < 1.25:
+        return "the readings as they are", ErrorModel(np.eye(3), np.zeros(3))
+    return "one scale factor for all axes and the estimated bias, no misalignment", ErrorModel(
+        scale * np.eye(3), centre[-3:]
+    )
+
+
+def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple[float | None, float | None]:
+    """Return s over the noise that the scatter within poses predicts, and the chance of so large a ratio."""
+    if readings.scatter is None or readings.count is None or freedom < 1 or not s > 0:
+        return None, None
+    force = readings.scatter / np.diagonal(low.K)
+    u = low.specific_force(readings.output())
+    u = u / np.linalg.norm(u, axis=1, keepdims=True)
+    variance = np.mean(np.sum((u * force) ** 2, axis=1) / readings.count)
+    if not variance > 0:
+        return None, None
+    from scipy.special import chdtrc
+
+    ratio = s / float(np.sqrt(variance))
+    return ratio, float(chdtrc(freedom, freedom * ratio**2))
+
+
+def _dop(seen: Observability) -> Dop:
+    return Dop(
+        misalignment=float(seen.dop[quality.MISALIGNMENT].max()),
+        scale=float(seen.dop[quality.SCALE].max()),
+        bias=float(seen.dop[quality.BIAS].max()),
+        worst=seen.worst,
+        parameters=dict(zip(quality.PARAMETERS, seen.dop.tolist(), strict=True)),
+    )
+
+
+def _pose_fits(readings: Readings, fit: Fit) -> tuple[PoseFit, ...]:
+    r = fit.poses
+    return tuple(
+        PoseFit(
+            int(j),
+            readings.where(int(j)),
+            float(r.error[i]),
+            float(r.studentised[i]),
+            float(r.leverage[i]),
+            float(r.left_out[i]),
+        )
+        for i, j in enumerate(r.pose)
+    )
+
+
+def _curve(solution: Solution) -> tuple[tuple[int, float], ...]:
+    """Return the best run's best cost so far against its evaluations, thinned."""
+    search = solution.search
+    if search.trace is None or search.trace_evaluations is None:
+        return ()
+    last = int(search.iterations[solution.best]) + 1
+    keep = np.unique(np.linspace(0, last - 1, min(last, CURVE_POINTS)).round().astype(int))
+    counts, costs = search.trace_evaluations[solution.best][keep], search.trace[solution.best][keep]
+    return tuple((int(n), float(cost)) for n, cost in zip(counts, costs, strict=True) if np.isfinite(cost))
+
+
+def _notes(solution: Solution, start: Start, settings: Settings) -> tuple[str, ...]:
+    notes = []
+    names = ("K11", "K22", "K33", "K21", "K31", "K32", "K12", "K13", "K23")[: solution.x.shape[1] - 3]
+    names = (*names, "Dx", "Dy", "Dz")
+    edge = [n for n, u in zip(names, solution.x[0], strict=True) if abs(u) >= 1.0 - EDGE]
+    if edge:
+        notes.append(f"At the edge of the search box: {', '.join(edge)}. Widen the box (--config, key box).")
+    if start.source == "mid-range":
+        notes.append("The readings fix no ellipsoid; the search started from the middle of their range.")
+    if not np.isfinite(solution.search.cost).any():
+        notes.append(f"The {settings.optimizer} search failed; the result is the polished nominal sensor.")
+    if settings.runs > 1 and solution.agreeing < settings.runs:
+        notes.append(f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.")
+    return tuple(notes)
+
+
+def _settings_record(settings: Settings, start: Start) -> dict[str, object]:
+    """Return the settings as stated, with the optimizer's parameters and the box filled in."""
+    record = asdict(settings)
+    record["parameters"] = asdict(settings.build_optimizer())
+    record["box"] = {
+        **asdict(settings.box),
+        "centre": start.box.centre[0].tolist(),
+        "half_width": start.box.half[0].tolist(),
+        "source": start.source,
+    }
+    record["version"] = __version__
+    return record

@@ -1,0 +1,171 @@
+"""How well the poses determine the parameters: information, covariance, dilution of precision, verdict.
+
+Nine parameters, all as specific force in m/s^2 and always in gauge `lower`: g times the entries of the
+lower-triangular E in K_A = (I + E) K_A0, and K_A0's diagonal times the bias. Their residuals are
+e_j = (g^2 - |f_j|^2) / 2g. The dilution of precision of a parameter is the square root of its entry in
+(J^T J)^-1: how many times the noise of one pose its error comes out. It depends on the poses alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from accelcal_cli.calibration.lotters import ROWS_COLUMNS, Loetters, pack
+from accelcal_cli.streams import Float
+
+PARAMETERS = (
+    "scale factor x",
+    "scale factor y",
+    "scale factor z",
+    "misalignment xy",
+    "misalignment xz",
+    "misalignment yz",
+    "bias x",
+    "bias y",
+    "bias z",
+)
+SCALE, MISALIGNMENT, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+
+WEAK, UNDETERMINED = 10.0, 25.0
+"""Thresholds of the dilution of precision. Of 16 real pose sets those with usable parameters stayed below 9.4;
+those with an excellent residual and useless parameters had 25 to 1850."""
+
+RANK_TOLERANCE = 1e-12
+"""An eigenvalue of the information below this part of the largest is zero: double precision's square root of
+it, 1e-6, is the smallest relative difference between poses that an ordinary CSV file can carry."""
+
+Verdict = Literal["good", "weak", "undetermined"]
+
+
+def design(u: Float) -> Float:
+    """Return d e / d parameters, shape (J, 9), for unit directions u of the specific force, shape (J, 3)."""
+    pairs = [u[:, i] * u[:, j] for i, j in ROWS_COLUMNS[:6]]
+    return np.stack([*(-p for p in pairs), u[:, 0], u[:, 1], u[:, 2]], axis=1)
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What a set of poses says about the nine parameters.
+
+    Attributes:
+        cofactor: (J^T J)^-1, its pseudo-inverse when the rank is below nine, shape (9, 9).
+        dop: dilution of precision of each parameter, shape (9,); inf where the poses do not determine it.
+        rank: number of determined directions, at most 9.
+    """
+
+    cofactor: Float
+    dop: Float
+    rank: int
+
+    @classmethod
+    def of(cls, information: Float, poses: int) -> Observability:
+        """Return the observability of an information matrix J^T J, shape (9, 9), from `poses` poses."""
+        values, vectors = np.linalg.eigh(information)
+        known = values > RANK_TOLERANCE * values[-1]
+        inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
+        cofactor = (vectors * inverse) @ vectors.T
+        dop = np.sqrt(np.diagonal(cofactor))
+        free = (vectors[:, ~known] ** 2).sum(axis=1) > 1e-12
+        return cls(cofactor, np.where(free, np.inf, dop), min(int(known.sum()), poses))
+
+    @property
+    def worst(self) -> float:
+        """The largest dilution of precision."""
+        return float(self.dop.max())
+
+    @property
+    def verdict(self) -> Verdict:
+        """Definition: undetermined above 25 or below rank 9, weak above 10, good otherwise."""
+        if self.rank < 9 or self.worst > UNDETERMINED:
+            return "undetermined"
+        return "weak" if self.worst > WEAK else "good"
+
+    def above(self, limit: float) -> list[str]:
+        """Return the names of the parameters whose dilution of precision is above `limit`, worst first."""
+        order = np.argsort(-self.dop, kind="stable")
+        return [PARAMETERS[i] for i in order if self.dop[i] > limit]
+
+
+def information(problem: Loetters, x: Float) -> Float:
+    """Return J^T J of the nine parameters, shape (R, 9, 9), at x, shape (R, 9), from the compressed readings.
+
+    The chain runs over K_a = K_a0 (I + E)^-1, so dK_a = -K_a0 E, and dD_i = K_ii times the bias as force.
+    """
+    K, _ = problem.parameters(x)
+    chain = np.zeros((len(K), 9, 9))
+    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+        change = np.zeros_like(K)
+        change[:, :, j] = -K[:, :, i] / problem.g
+        chain[:, :, p] = pack(change, np.zeros((len(K), 3)), 9)
+    for i in range(3):
+        chain[:, 6 + i, 6 + i] = K[:, i, i]
+    jacobian = problem.jacobian(x[:, None])[:, 0] / problem.units[:, None, :] @ chain / (2.0 * problem.g)
+    result: Float = jacobian.swapaxes(1, 2) @ jacobian
+    return result
+
+
+def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float) -> tuple[Float, Float]:
+    """Return one-sigma of K_a in a gauge, shape (3, 3), and of D_a, shape (3,).
+
+    Args:
+        K: K_a in `gauge`; K_lower: the same sensor in gauge `lower`.
+        covariance: of the nine parameters, (m/s^2)^2, shape (9, 9).
+        gauge: `lower`, `upper` or `symmetric`; in `full` the off-diagonals are not observable one by one and
+            come out as NaN.
+        g: local gravity, m/s^2.
+
+    A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
+    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions.
+    """
+    R = np.linalg.solve(K, K_lower)
+    skew = [_skew(axis) for axis in np.eye(3)]
+    turns = np.stack([_conditions(K @ w, gauge) for w in skew], axis=1)
+    columns = []
+    for i, j in ROWS_COLUMNS[:6]:
+        E = np.zeros((3, 3))
+        E[i, j] = 1.0 / g
+        moved = R @ E @ R.T
+        change = -K @ moved
+        if gauge == "full":
+            change = -K @ (0.5 * (moved + moved.T))
+        else:
+            angle = np.linalg.solve(turns, -_conditions(change, gauge))
+            change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
+        columns.append(change.ravel())
+    chain = np.stack(columns, axis=1)
+    variance = np.einsum("ip,pq,iq->i", chain, covariance[:6, :6], chain).reshape(3, 3)
+    sigma_K = np.sqrt(np.maximum(variance, 0.0))
+    if gauge == "full":
+        sigma_K = np.where(np.eye(3) > 0, sigma_K, np.nan)
+    return sigma_K, np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+
+
+def _conditions(change: Float, gauge: str) -> Float:
+    """Return what must vanish for a change of K to stay in the gauge, shape (3,)."""
+    above, below = change[[0, 0, 1], [1, 2, 2]], change[[1, 2, 2], [0, 0, 1]]
+    return {"lower": above, "upper": below}.get(gauge, above - below)
+
+
+def _skew(axis: Float) -> Float:
+    x, y, z = axis
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def in_words(seen: Observability, suggestions: Sequence[str]) -> tuple[str, ...]:
+    """Return the verdict in plain sentences: what is not determined, what is weak, and what would mend it."""
+    lines = []
+    lost = seen.above(UNDETERMINED)
+    if lost:
+        lines.append(f"The poses do not determine: {', '.join(lost)}.")
+    elif seen.rank < 9:
+        lines.append("The poses do not determine all nine parameters.")
+    weak = [name for name in seen.above(WEAK) if name not in lost]
+    if weak:
+        lines.append(f"Weakly determined: {', '.join(weak)}.")
+    if lines and suggestions:
+        lines.append("Poses that would mend it: " + "; ".join(suggestions) + ".")
+    return tuple(lines)

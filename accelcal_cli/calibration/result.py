@@ -1,0 +1,208 @@
+"""The result of a calibration: one frozen record that carries its units, its uncertainty and its origin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.streams import Float
+
+SCHEMA = "accelcal/calibration/1"
+"""Name and version of the record; a reader refuses what it does not know."""
+
+
+@dataclass(frozen=True)
+class Sigma:
+    """One-sigma of the parameters; NaN where the poses do not determine them.
+
+    Attributes:
+        K_a: shape (3, 3), output units per m/s^2.
+        D_a: shape (3,), output units.
+    """
+
+    K_a: Float
+    D_a: Float
+
+
+@dataclass(frozen=True)
+class Dop:
+    """Dilution of precision: the error of a parameter, as m/s^2 at 1 g, over the noise of one pose in m/s^2.
+
+    Attributes:
+        misalignment, scale, bias: the largest of each kind.
+        worst: the largest of all.
+        parameters: each of the nine by its name.
+    """
+
+    misalignment: float
+    scale: float
+    bias: float
+    worst: float
+    parameters: dict[str, float]
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual."""
+
+    pose: int
+    where: str
+    residual: float
+    studentised: float
+    leverage: float
+    left_out: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated accelerometer. Units: f in m/s^2 (units of g when g = 1), N in output units.
+
+    Attributes:
+        K_a: pulse-equivalent matrix, shape (3, 3), output units per m/s^2, in `gauge`.
+        D_a: bias, shape (3,), output units.
+        K_A: inverse matrix, shape (3, 3); f_0 = K_A D_a, shape (3,), m/s^2.
+        gauge: lower, upper, symmetric or full.
+        sigma: one-sigma of K_a and D_a.
+        dop: dilution of precision.
+        verdict: good, weak or undetermined; `reasons` says why in sentences.
+        cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
+        rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
+        s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
+        covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9).
+        nominal_scale: what scale-factor errors are relative to, output units per m/s^2, shape (3,).
+        poses: J; freedom: J - 9.
+        evaluations: of the cost, search and polish together.
+        runs, runs_agreeing: searches made, and how many ended in the best one's minimum.
+        poses_worst: residuals pose by pose (all up to 1000 poses, the worst 20 of more).
+        convergence: best cost so far against evaluations, of the best run, thinned.
+        optimizer: its name; settings: everything needed to repeat the run.
+        data: source, sha256, columns of the readings.
+        notes: sentences about the data and the search that a user should know.
+    """
+
+    K_a: Float
+    D_a: Float
+    K_A: Float
+    f_0: Float
+    gauge: str
+    sigma: Sigma
+    dop: Dop
+    verdict: str
+    reasons: tuple[str, ...]
+    suggestions: tuple[str, ...]
+    cost_search: float
+    cost: float
+    rms: float
+    rms_before: float
+    before: str
+    s: float
+    freedom: int
+    noise_ratio: float | None
+    noise_chance: float | None
+    covariance: Float
+    nominal_scale: Float
+    poses: int
+    evaluations: int
+    runs: int
+    runs_agreeing: int
+    poses_fit: tuple[PoseFit, ...]
+    outliers: tuple[int, ...]
+    convergence: tuple[tuple[int, float], ...]
+    optimizer: str
+    settings: dict[str, Any]
+    g: float
+    data: dict[str, Any]
+    notes: tuple[str, ...]
+    version: str
+    schema: str = SCHEMA
+
+    @property
+    def model(self) -> ErrorModel:
+        """The sensor in the result's gauge."""
+        return ErrorModel(self.K_a, self.D_a)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the specific force: g when the readings were calibrated against g = 1."""
+        return "g" if self.g == 1.0 else "m/s^2"
+
+    def record(self) -> dict[str, Any]:
+        """Return the record as plain mappings, lists, numbers and text; NaN and inf become None."""
+        plain: dict[str, Any] = _plain(self)
+        return plain
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any], where: str) -> Calibration:
+        """Return the calibration of a record.
+
+        Raises:
+            DataError: not a record of this schema, or a part missing.
+        """
+        if record.get("schema") != SCHEMA:
+            raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
+        missing = [f.name for f in fields(cls) if f.name not in record]
+        if missing:
+            raise DataError(f"{where}: not a whole calibration result; missing: {', '.join(missing)}")
+        try:
+            return cls(**{f.name: _rebuild(f.name, record[f.name]) for f in fields(cls)})
+        except (TypeError, ValueError, KeyError, AttributeError) as error:
+            raise DataError(f"{where}: not a calibration result: {error}") from None
+
+
+ARRAYS = ("K_a", "D_a", "K_A", "f_0", "covariance", "nominal_scale")
+NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
+
+
+def _rebuild(name: str, value: Any) -> Any:
+    if name in ARRAYS:
+        return _array(value)
+    if name == "sigma":
+        return Sigma(_array(value["K_a"]), _array(value["D_a"]))
+    if name == "dop":
+        parameters = {key: _infinite(v) for key, v in value["parameters"].items()}
+        return Dop(*(_infinite(value[k]) for k in ("misalignment", "scale", "bias", "worst")), parameters)
+    if name == "poses_fit":
+        return tuple(PoseFit(**{k: math.nan if v is None else v for k, v in row.items()}) for row in value)
+    if name == "convergence":
+        return tuple((int(n), float(cost)) for n, cost in value)
+    if name in NUMBERS_OR_NAN:
+        return math.nan if value is None else float(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _array(value: Any) -> Float:
+    return np.array(
+        [
+            [math.nan if v is None else v for v in row]
+            if isinstance(row, list)
+            else (math.nan if row is None else row)
+            for row in value
+        ],
+        dtype=float,
+    )
+
+
+def _infinite(value: float | None) -> float:
+    return math.inf if value is None else float(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if hasattr(value, "__dataclass_fields__"):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    return value

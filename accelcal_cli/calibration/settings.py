@@ -1,0 +1,72 @@
+"""What a calibration is told: model, box, optimizer, robustness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from accelcal_cli.errors import ConfigError
+from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer
+from accelcal_cli.registry import check, setting
+from accelcal_cli.sensor.model import Gauge
+from accelcal_cli.sensor.units import STANDARD_GRAVITY
+
+Robust = Literal["none", "huber", "soft-l1"]
+Weights = Literal["none", "n", "sd"]
+
+
+@dataclass(frozen=True)
+class BoxSettings:
+    """Half-widths of the search box around the nominal sensor."""
+
+    scale: float = setting(0.05, "scale factors, part of nominal", above=0, high=0.9)
+    misalignment: float = setting(0.06, "misalignments, rad", above=0, high=0.7)
+    bias: float = setting(0.10, "bias, part of g times nominal scale factor", above=0, high=10)
+
+    def __post_init__(self) -> None:
+        """Refuse a half-width outside its range."""
+        check(self)
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """A stated nominal sensor; what is left out is estimated from the readings."""
+
+    scale: tuple[float, float, float] = setting(None, "scale factors, output units per m/s^2")
+    bias: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "bias, output units")
+
+    def __post_init__(self) -> None:
+        """Refuse a nominal sensor without positive scale factors."""
+        if self.scale is None or min(self.scale) <= 0:
+            raise ConfigError("scale: expected three positive scale factors in output units per m/s^2")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides a calibration besides its readings; the YAML keys of `--config`."""
+
+    optimizer: str = setting("de-pso", "name of the optimizer")
+    parameters: dict[str, Any] = field(default_factory=dict)
+    g: float = setting(STANDARD_GRAVITY, "local gravity, m/s^2; 1 for readings in units of g", above=0)
+    gauge: Gauge = setting("lower", "which of the equivalent matrices is shown")
+    runs: int = setting(1, "independent searches (multi-start)", low=1, high=100_000)
+    seed: int = setting(0, "seed of all random numbers", low=0)
+    polish: bool = setting(True, "finish by Levenberg-Marquardt")
+    robust: Robust = setting("none", "loss: none is least squares")
+    weights: Weights = setting(
+        "none", "weight of a pose: none, n (readings averaged) or sd (their scatter and n)"
+    )
+    box: BoxSettings = field(default_factory=BoxSettings)
+    nominal: Nominal | None = setting(None, "stated nominal sensor; estimated when left out")
+
+    def __post_init__(self) -> None:
+        """Refuse a setting outside its range."""
+        check(self)
+
+    def build_optimizer(self) -> Optimizer:
+        """Return the optimizer with its parameters.
+
+        Raises:
+            ConfigError: unknown optimizer or parameter.
+        """
+        return OPTIMIZERS.build(self.optimizer, self.parameters, f"optimizer {self.optimizer}")
