@@ -127,7 +127,9 @@ def _separator(lines: list[str]) -> str:
         return " "
     comma = _numeric_share(cell for line in bare for cell in line.split(","))
     blank = _numeric_share(
-        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for line in bare for cell in line.split()
+        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
+        for line in bare
+        for cell in line.split()
     )
     return " " if blank > comma else ","
 

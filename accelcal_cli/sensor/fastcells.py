@@ -56,9 +56,7 @@ class FastParser:
         import polars as pl
 
         dialect, selection = self.careful.dialect, self.careful.selection
-        schema = {
-            str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)
-        }
+        schema = {str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)}
         try:
             frame = pl.read_csv(
                 block,
@@ -84,7 +82,7 @@ class FastParser:
             if series.null_count():
                 return None
             numbers[:, k] = series.to_numpy()
-        sound = -LIMIT <= numbers.min() and numbers.max() <= LIMIT  # nan fails both
+        sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
         return numbers if sound else None
 
 

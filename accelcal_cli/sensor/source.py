@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from accelcal_cli.errors import DataError, did_you_mean
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
 
 HEAD = 4 << 20  # bytes: an input up to this size is one block and never needs polars
 BLOCK = 16 << 20  # bytes of a later block
@@ -90,11 +92,17 @@ class ByteSource:
     def _next(self) -> bytes:
         raw = self._read(self._block)
         if raw:
-            self._pool = self._pool or ThreadPoolExecutor(1)
-            if self._pending is not None:
-                self._pending.result()
-            self._pending = self._pool.submit(self._hash.update, raw)
+            self._hash_beside(raw)
         return self._unify(raw)
+
+    def _hash_beside(self, raw: bytes) -> None:
+        if self._pool is None:
+            from concurrent.futures import ThreadPoolExecutor  # small inputs do without
+
+            self._pool = ThreadPoolExecutor(1)
+        if self._pending is not None:
+            self._pending.result()
+        self._pending = self._pool.submit(self._hash.update, raw)
 
     def _unify(self, raw: bytes) -> bytes:
         return raw.replace(b"\r", b"\n") if self._carriage_returns else raw

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
@@ -32,6 +32,8 @@ class RowStore:
 
     def append(self, rows: NDArray[np.float64]) -> None:
         """Add rows (B, width)."""
+        if not len(rows):
+            return
         self._parts.append(np.array(rows, dtype=np.float64, order="C"))
         self.rows += len(rows)
         if self.rows > self._limit:
@@ -66,15 +68,18 @@ class RowStore:
 
     def _spill(self) -> None:
         if self._file is None:
+            import tempfile  # costs as much as reading a small table
+
             self._file = tempfile.TemporaryFile(prefix="accelcal-", buffering=0)  # noqa: SIM115
+        self._file.seek(0, os.SEEK_END)
         for part in self._parts:
-            view = memoryview(part).cast("B")
+            view = part.data.cast("B")
             while view:  # an unbuffered write may take less than all
                 view = view[self._file.write(view) :]
         self._parts.clear()
 
     def _fill(self, block: NDArray[np.float64]) -> None:
-        view = memoryview(block).cast("B")
+        view = block.data.cast("B")
         while view:
             got = self._file.readinto(view) if self._file is not None else 0  # type: ignore[attr-defined]
             if not got:
@@ -87,7 +92,9 @@ def _named_disk_errors() -> Iterator[None]:
     try:
         yield
     except OSError as problem:
+        from tempfile import gettempdir
+
         raise DataError(
-            f"{tempfile.gettempdir()}: no room for the readings beyond {IN_MEMORY:,} rows "
+            f"{gettempdir()}: no room for the readings beyond {IN_MEMORY:,} rows "
             f"({problem.strerror or problem}); free some space, or set TMPDIR to a larger folder"
         ) from problem

@@ -28,6 +28,10 @@ class Table(Protocol):
         """Which columns hold numbers, judged by type or by the first row."""
 
     @property
+    def has_rows(self) -> bool:
+        """Whether there is anything below the header."""
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the input, once all blocks have been read."""
 
@@ -51,6 +55,7 @@ class TextTable:
         self.names = self.dialect.names
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
+        self.has_rows = bool(self.dialect.first)
         self._source = source
         self._lines = LineMap()
 
