@@ -1,0 +1,173 @@
+"""Which columns of a table to read: the user's choice, or the names' own word."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from accelcal_cli.errors import DataError, UsageError, did_you_mean
+from accelcal_cli.sensor.cells import Selection
+from accelcal_cli.sensor.colnames import Roles, recognise, tokens_of
+from accelcal_cli.sensor.tabular import Table
+
+Triple = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a table of readings, counted from 0."""
+
+    output: Triple
+    names: tuple[str, str, str]
+    label: int | None = None
+    count: int | None = None
+    scatter: Triple | None = None
+    reference: Triple | None = None
+    temperature: int | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def extras(self) -> tuple[int, ...]:
+        """Numeric columns beside the output: count, scatter, reference, temperature, as far as present."""
+        count = () if self.count is None else (self.count,)
+        warmth = () if self.temperature is None else (self.temperature,)
+        return (*count, *(self.scatter or ()), *(self.reference or ()), *warmth)
+
+    def selection(self) -> Selection:
+        """What to ask of the table; a standard deviation or temperature may be missing in a row."""
+        gaps = frozenset((*(self.scatter or ()), *(() if self.temperature is None else (self.temperature,))))
+        return Selection((*self.output, *self.extras), gaps, self.label)
+
+
+def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
+    """Find the three output columns and the optional ones; DataError or UsageError if in doubt."""
+    if not table.has_rows:
+        raise DataError(f"{table.name}: has a header but no readings below it")
+    names = table.names
+    roles = recognise(names) if names is not None else Roles()
+    note: tuple[str, ...] = ()
+    if wanted is not None:
+        output = _stated(table, [wanted] if isinstance(wanted, str) else wanted)
+    elif names is None:
+        output = _nameless(table)
+        note = ("no header: columns 1, 2, 3 taken as x, y, z",)
+    elif roles.families:
+        output = _only_family(table, roles)
+    else:
+        output = _only_numeric(table, names, roles)
+        note = (f"columns {_listed(names, output)} taken as x, y, z: the only three numeric ones",)
+    return _with_extras(table, output, roles, note)
+
+
+def _stated(table: Table, wanted: Sequence[str]) -> Triple:
+    words = (
+        [word.strip() for part in wanted for word in str(part).split(",")]
+        if len(wanted) == 1
+        else list(wanted)
+    )
+    if len(words) != 3:
+        raise UsageError(f"--columns: three columns were expected (x, y, z), not {len(words)}")
+    found = [_column(table, str(word).strip()) for word in words]
+    for k, column in enumerate(found):
+        if column in found[:k]:
+            raise UsageError(f'--columns: column "{words[k]}" is asked for twice')
+    return found[0], found[1], found[2]
+
+
+def _column(table: Table, word: str) -> int:
+    """Find a column by exact name, by name in any case, or by number."""
+    names, width = table.names, len(table.numeric)
+    for fold in (str, str.lower):
+        matches = [k for k, name in enumerate(names or ()) if fold(name) == fold(word)]
+        if len(matches) > 1:
+            numbers = " and ".join(str(k + 1) for k in matches)
+            raise UsageError(
+                f'--columns: "{word}" could be columns {numbers} of {table.name}; give the number'
+            )
+        if matches:
+            return matches[0]
+    if word.isascii() and word.isdigit():
+        if 1 <= int(word) <= width:
+            return int(word) - 1
+        raise UsageError(f"--columns: no column {word}; {table.name} has columns 1 to {width}")
+    if names is None:
+        raise UsageError(
+            f'--columns: no column "{word}": {table.name} has no header; give numbers from 1 to {width}'
+        )
+    hint = did_you_mean(word, names) or f"; there are {_listed(names, range(width))}"
+    raise UsageError(f'--columns: no column "{word}" in {table.name}{hint}')
+
+
+def _nameless(table: Table) -> Triple:
+    width = len(table.numeric)
+    if width == 3:
+        return 0, 1, 2
+    if width < 3:
+        raise DataError(
+            f"{table.name}: has {width} column{'s' * (width != 1)} where three (x, y, z) were expected"
+        )
+    raise DataError(
+        f"{table.name}: has {width} columns and no header; say which three are x, y, z, as in --columns 1,2,3"
+    )
+
+
+def _only_family(table: Table, roles: Roles) -> Triple:
+    if len(roles.families) > 1:
+        raise DataError(
+            f"{table.name}: the readings could be {' or '.join(roles.families)}; say which with --columns"
+        )
+    return next(iter(roles.families.values()))
+
+
+def _only_numeric(table: Table, names: Sequence[str], roles: Roles) -> Triple:
+    known = {*(roles.reference or ()), roles.count, roles.temperature, roles.label, *roles.other}
+    known.update(column for triple in roles.scatter.values() for column in triple)
+    left = [k for k, numeric in enumerate(table.numeric) if numeric and k not in known]
+    if len(left) == 3:
+        return left[0], left[1], left[2]
+    if len(names) < 3:
+        raise DataError(f"{table.name}: has {len(names)} column(s) where three (x, y, z) were expected")
+    raise DataError(
+        f"{table.name}: no column names such as ax, ay, az; say which columns are x, y, z with --columns "
+        f"(there are {_listed(names, range(len(names)))})"
+    )
+
+
+def _with_extras(table: Table, output: Triple, roles: Roles, note: tuple[str, ...]) -> Columns:
+    """Add the optional columns that are not themselves the output."""
+    names = table.names
+
+    def free(column: int | None) -> int | None:
+        return None if column in output else column
+
+    def free_triple(triple: Triple | None) -> Triple | None:
+        return None if triple is None or set(triple) & set(output) else triple
+
+    shown = [str(k + 1) if names is None or not names[k] else names[k] for k in output]
+    scatter = _scatter_of(names, output, roles)
+    chosen = Columns(
+        output,
+        (shown[0], shown[1], shown[2]),
+        free(roles.label),
+        free(roles.count),
+        free_triple(scatter),
+        free_triple(roles.reference),
+        free(roles.temperature),
+    )
+    used = [k for k in (chosen.label, *chosen.extras) if k is not None]
+    if names is not None and used:
+        note = (*note, f"column{'s' * (len(used) > 1)} {_listed(names, used)} found")
+    return replace(chosen, notes=(*note, *roles.partial))
+
+
+def _scatter_of(names: Sequence[str] | None, output: Triple, roles: Roles) -> Triple | None:
+    """Find the standard deviations that belong to the output: those of its own family, or of none."""
+    if names is None:
+        return None
+    family = "".join(tokens_of(names[output[0]]))[:-1]
+    return roles.scatter.get(family, roles.scatter.get(""))
+
+
+def _listed(names: Sequence[str], columns: Sequence[int]) -> str:
+    listed = ", ".join(f'"{names[k]}"' for k in columns[:20])
+    return listed + (f" and {len(columns) - 20} more" if len(columns) > 20 else "")

@@ -1,0 +1,111 @@
+"""The fast parser of table rows: polars on whole blocks, wherever that is sure to mean the same."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.sensor.cells import LIMIT, CarefulParser, Rows
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+class FastParser:
+    """Parses what polars reads beyond doubt, and hands every other block to the careful parser.
+
+    Beyond doubt: no quotes, comments or blank lines, every row as wide as the first, every number finite.
+    So the careful parser alone says what a table means, and words every error.
+    """
+
+    def __init__(self, careful: CarefulParser) -> None:
+        """Share rows, lines and selection with `careful`."""
+        self.careful = careful
+
+    def parse(self, block: bytes) -> Rows:
+        """Rows of a block of whole lines."""
+        if self.careful.line < self.careful.dialect.header_line or self.careful.line == 0:
+            return self.careful.parse(block)
+        plain = self._plain(block)
+        frame = None if plain is None else self._frame(plain)
+        numbers = None if frame is None else self._numbers(frame)
+        if frame is None or numbers is None:
+            return self.careful.parse(block)
+        column = self.careful.selection.text
+        text = None if column is None else frame[str(column)].to_list()
+        return Rows(self.careful.skip(len(numbers)), numbers, text)
+
+    def _plain(self, block: bytes) -> bytes | None:
+        """The block with one-byte separators only, or None if it needs care."""
+        dialect = self.careful.dialect
+        if b'"' in block or b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+            return None
+        if dialect.decimal_comma and (b"." in block or dialect.separator == ","):
+            return None
+        if not block.isascii() and not _is_utf8(block):
+            return None
+        if b"\r" in block:
+            block = block.replace(b"\r\n", b"\n")
+        block = _squeeze(block, dialect.separator.encode())
+        odd = b"\r" in block or block.startswith(b"\n") or block.endswith(b"\n\n")
+        return None if odd else block
+
+    def _frame(self, block: bytes) -> pl.DataFrame | None:
+        import polars as pl
+
+        dialect, selection = self.careful.dialect, self.careful.selection
+        schema = {str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)}
+        try:
+            frame = pl.read_csv(
+                block,
+                has_header=False,
+                schema=schema,
+                separator=dialect.separator,
+                quote_char=None,
+                decimal_comma=dialect.decimal_comma,
+            )
+        except pl.exceptions.PolarsError:
+            return None
+        if dialect.width - 1 not in selection.numbers:  # a short row then shows only in the count
+            separators = np.count_nonzero(np.frombuffer(block, np.uint8) == ord(dialect.separator))
+            if separators != (dialect.width - 1) * len(frame):
+                return None
+        return frame
+
+    def _numbers(self, frame: pl.DataFrame) -> NDArray[np.float64] | None:
+        columns = self.careful.selection.numbers
+        numbers = np.empty((len(frame), len(columns)))
+        for k, column in enumerate(columns):
+            series = frame[str(column)]
+            if series.null_count():
+                return None
+            numbers[:, k] = series.to_numpy()
+        sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
+        return numbers if sound else None
+
+
+def _is_utf8(block: bytes) -> bool:
+    try:
+        block.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _squeeze(block: bytes, separator: bytes) -> bytes:
+    """Drop the blanks around cells; for a white-space table leave one blank between them."""
+    blanks = (b" ",) if separator == b"\t" else (b" ", b"\t")
+    if not any(blank in block for blank in blanks):
+        return block
+    if separator == b" ":
+        block = block.replace(b"\t", b" ")
+        for run in (b"        ", b"   ", b"  ", b"  "):
+            block = block.replace(run, b" ")
+    for blank in blanks:
+        for edge in (b"\n", separator):
+            for pair in (edge + blank, blank + edge) if edge != blank else ():
+                while pair in block:
+                    block = block.replace(pair, edge)
+    return block.removeprefix(b" ")

@@ -1,0 +1,127 @@
+"""Tables in Parquet form."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.cells import LIMIT, Rows, Selection
+from accelcal_cli.sensor.source import ByteSource
+
+ROWS = 500_000  # rows of a block
+
+
+class ParquetTable:
+    """A Parquet file, streamed a batch of rows at a time."""
+
+    has_rows: bool
+
+    def __init__(self, source: ByteSource) -> None:
+        """Copy `source` to a temporary file, for Parquet is read from its end, and look at its schema.
+
+        The copy is what the hash speaks of, even if the original changes meanwhile.
+        """
+        self.name = source.name
+        self._source = source
+        self._files = ExitStack()
+        try:
+            self._path = self._copy()
+            with _named_errors(self.name):
+                frame = pl.scan_parquet(self._path)
+                schema = frame.collect_schema()
+                self.has_rows = bool(frame.head(1).collect().height)
+        except BaseException:
+            self._files.close()
+            raise
+        self.names: tuple[str, ...] = tuple(schema)
+        self.numeric = tuple(kind.is_numeric() for kind in schema.values())
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the file."""
+        return self._source.sha256
+
+    def blocks(self, selection: Selection) -> Iterator[Rows]:
+        """Read the selected columns."""
+        for column in selection.numbers:
+            if not self.numeric[column]:
+                raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
+        start = 0
+        for frame in self._batches(selection):
+            numbers = np.empty((frame.height, len(selection.numbers)))
+            for k, column in enumerate(selection.numbers):
+                numbers[:, k] = frame[f"n{k}"].to_numpy()
+                self._check(numbers[:, k], start, column, column in selection.gaps)
+            text = None if selection.text is None else self._labels(frame["text"], start, selection.text)
+            yield Rows(start, numbers, text)
+            start += frame.height
+
+    def where(self, row: int) -> str:
+        """Row number, counted from 1."""
+        return f"row {row + 1}"
+
+    def close(self) -> None:
+        """Remove the copy and close the file."""
+        self._files.close()
+        self._source.close()
+
+    def _copy(self) -> Path:
+        try:
+            copy = self._files.enter_context(
+                tempfile.NamedTemporaryFile(prefix="accelcal-", suffix=".parquet")
+            )
+            copy.write(self._source.head)
+            for block in self._source.rest():
+                copy.write(block)
+            copy.flush()
+        except OSError as problem:
+            raise DataError(
+                f"{self.name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})"
+            ) from problem
+        return Path(copy.name)
+
+    def _batches(self, selection: Selection) -> Iterator[pl.DataFrame]:
+        wanted = [
+            pl.col(self.names[column]).cast(pl.Float64).alias(f"n{k}").fill_null(float("nan"))
+            for k, column in enumerate(selection.numbers)
+        ]
+        if selection.text is not None:
+            wanted.append(pl.col(self.names[selection.text]).cast(pl.String).alias("text"))
+        frame = pl.scan_parquet(self._path).select(wanted)
+        with _named_errors(self.name):
+            yield from frame.collect_batches(chunk_size=ROWS, maintain_order=True)
+
+    def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
+        bad = ~(np.abs(numbers) <= LIMIT)
+        if gaps:
+            bad &= ~np.isnan(numbers)
+        if bad.any():
+            row = int(np.argmax(bad))
+            value = numbers[row]
+            what = "is empty or nan" if np.isnan(value) else f"{value:g} is too large or infinite"
+            where = f'{self.name}, {self.where(start + row)}, column "{self.names[column]}"'
+            raise DataError(f"{where}: {what}; a finite number was expected")
+
+    def _labels(self, series: pl.Series, start: int, column: int) -> list[str]:
+        labels: list[str | None] = series.to_list()
+        for row, label in enumerate(labels):
+            if not label:
+                where = f'{self.name}, {self.where(start + row)}, column "{self.names[column]}"'
+                raise DataError(f"{where}: is empty; every row needs its position label")
+        return [label or "" for label in labels]
+
+
+@contextmanager
+def _named_errors(name: str) -> Iterator[None]:
+    """Word what polars finds wrong with a file; a panic of its decoder is no subclass of its errors."""
+    try:
+        yield
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as problem:
+        reason = str(problem).strip().splitlines()[0][:200]
+        raise DataError(f"{name}: cannot be read as Parquet ({reason})") from problem

@@ -1,0 +1,145 @@
+"""Input bytes: opened, hashed and cut into blocks of whole lines."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from accelcal_cli.errors import DataError, did_you_mean
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+HEAD = 4 << 20  # bytes: an input up to this size is one block and never needs polars
+BLOCK = 16 << 20  # bytes of a later block
+LONGEST_LINE = 1 << 20  # bytes
+
+_FOREIGN = {  # first bytes of what people hand over instead of text
+    b"\x1f\x8b": "gzip-compressed; unpack it first",
+    b"PK\x03\x04": "a zip archive or an Excel workbook; export the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook; export the sheet as CSV",
+    b"\x89HDF": "an HDF5 file; export the readings as CSV or Parquet",
+    b"\xff\xfe": "UTF-16 text; save it as UTF-8",
+    b"\xfe\xff": "UTF-16 text; save it as UTF-8",
+}
+
+
+class ByteSource:
+    """One pass over a file or standard input; `sha256` covers the bytes read so far.
+
+    Hashing runs in a thread beside the parser: hashlib releases the interpreter lock, and at 10 million
+    rows the hash would otherwise cost as much as the parsing.
+    """
+
+    def __init__(self, stream: BinaryIO, name: str, *, head: int = HEAD, block: int = BLOCK) -> None:
+        """Read the first `head` bytes of `stream`; `block` is the size in bytes of every later read."""
+        self.name = name
+        self._stream = stream
+        self._block = block
+        self._hash = hashlib.sha256()
+        self._pool: ThreadPoolExecutor | None = None
+        self._pending: Future[None] | None = None
+        raw = self._read(head)
+        self.whole = len(raw) < head  # the head is all there is
+        self._hash.update(raw)
+        self._carriage_returns = b"\n" not in raw and b"\r" in raw  # line ends of old Macs
+        self.head = self._unify(raw)
+        for magic, what in _FOREIGN.items():
+            if raw.startswith(magic):
+                raise DataError(f"{name}: is {what}")
+
+    def close(self) -> None:
+        """Stop the hashing thread and close the file (standard input stays open)."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._stream is not sys.stdin.buffer:
+            self._stream.close()
+
+    @property
+    def sha256(self) -> str:
+        """Hexadecimal SHA-256 of the bytes read so far."""
+        if self._pending is not None:
+            self._pending.result()
+        return self._hash.hexdigest()
+
+    def blocks(self) -> Iterator[bytes]:
+        """Blocks of whole lines, the head first.
+
+        Only the last block may lack its line end, and one with a line longer than `LONGEST_LINE`: that line
+        comes cut, for the parser to refuse by its number.
+        """
+        data, more = self.head, not self.whole
+        while more:
+            cut = data.rfind(b"\n") + 1
+            if len(data) - cut > LONGEST_LINE:
+                break
+            if cut:
+                yield data[:cut]
+            fresh = self._next()
+            more = bool(fresh)
+            data = data[cut:] + fresh
+        if data:
+            yield data
+
+    def rest(self) -> Iterator[bytes]:
+        """Every byte after the head, uncut (for binary formats)."""
+        while not self.whole and (fresh := self._next()):
+            yield fresh
+
+    def _next(self) -> bytes:
+        raw = self._read(self._block)
+        if raw:
+            self._hash_beside(raw)
+        return self._unify(raw)
+
+    def _hash_beside(self, raw: bytes) -> None:
+        if self._pool is None:
+            from concurrent.futures import ThreadPoolExecutor  # small inputs do without
+
+            self._pool = ThreadPoolExecutor(1)
+        if self._pending is not None:
+            self._pending.result()
+        self._pending = self._pool.submit(self._hash.update, raw)
+
+    def _unify(self, raw: bytes) -> bytes:
+        return raw.replace(b"\r", b"\n") if self._carriage_returns else raw
+
+    def _read(self, size: int) -> bytes:
+        """Read `size` bytes, fewer only at the end: an unbuffered pipe gives what it has."""
+        try:
+            data = self._stream.read(size)
+            while data and len(data) < size and (more := self._stream.read(size - len(data))):
+                data += more
+        except OSError as problem:
+            raise DataError(f"{self.name}: cannot be read ({problem.strerror or problem})") from problem
+        return data
+
+
+def open_source(source: str | Path, stdin: BinaryIO | None = None) -> ByteSource:
+    """Open a path, or standard input for ``-``."""
+    if str(source) == "-":
+        return ByteSource(stdin or sys.stdin.buffer, "<stdin>")
+    path = Path(source)
+    try:
+        stream = path.open("rb")
+    except FileNotFoundError as problem:
+        raise DataError(f"{source}: no such file{_neighbour(path)}") from problem
+    except IsADirectoryError as problem:
+        raise DataError(f"{source}: is a directory; a file of readings was expected") from problem
+    except PermissionError as problem:
+        raise DataError(f"{source}: no permission to read it") from problem
+    except (OSError, ValueError) as problem:  # ValueError: a NUL in the name
+        raise DataError(f"{source}: cannot be opened ({problem})") from problem
+    return ByteSource(stream, str(source))
+
+
+def _neighbour(path: Path) -> str:
+    """Name the file in the same folder that was probably meant."""
+    try:
+        names = [entry.name for entry in path.parent.iterdir() if entry.is_file()]
+    except OSError:
+        return f'; the folder "{path.parent}" does not exist either'
+    return did_you_mean(path.name, names)

@@ -1,0 +1,99 @@
+"""Numeric tables as streams of row blocks: one face for text of any dialect and for Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+from accelcal_cli.sensor.cells import CarefulParser, LineMap, Rows, Selection
+from accelcal_cli.sensor.dialect import looks_numeric, sniff
+from accelcal_cli.sensor.fastcells import FastParser
+from accelcal_cli.sensor.source import ByteSource, open_source
+
+
+class Table(Protocol):
+    """A table that can be read once, from top to bottom."""
+
+    @property
+    def name(self) -> str:
+        """The path as given, or ``<stdin>``."""
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Column names, None where the table has no header."""
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Which columns hold numbers, judged by type or by the first row."""
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether there is anything below the header."""
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the input, once all blocks have been read."""
+
+    def blocks(self, selection: Selection) -> Iterator[Rows]:
+        """Read the selected columns, block after block, in constant memory."""
+
+    def where(self, row: int) -> str:
+        """How to name a row (from 0) that has been read, such as ``line 8``."""
+
+    def close(self) -> None:
+        """Release the file."""
+
+
+class TextTable:
+    """A table in text form."""
+
+    def __init__(self, source: ByteSource) -> None:
+        """Find the dialect of `source` from its head."""
+        self.name = source.name
+        self.dialect = sniff(source.head, source.name)
+        self.names = self.dialect.names
+        cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
+        self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
+        self.has_rows = bool(self.dialect.first)
+        self._source = source
+        self._lines = LineMap()
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the bytes read so far."""
+        return self._source.sha256
+
+    def blocks(self, selection: Selection) -> Iterator[Rows]:
+        """Read the selected columns; short inputs never import polars."""
+        careful = CarefulParser(self.name, self.dialect, selection)
+        self._lines = careful.lines
+        parse = careful.parse if self._source.whole else FastParser(careful).parse
+        for block in self._source.blocks():
+            yield parse(block)
+
+    def where(self, row: int) -> str:
+        """Line of a row."""
+        return f"line {self._lines.line(row)}"
+
+    def close(self) -> None:
+        """Release the file."""
+        self._source.close()
+
+
+def open_table(source: str | Path, stdin: BinaryIO | None = None) -> Table:
+    """Open a table of any supported form; ``-`` is standard input."""
+    stream = open_source(source, stdin)
+    try:
+        return _table(stream, Path(source))
+    except BaseException:
+        stream.close()
+        raise
+
+
+def _table(stream: ByteSource, path: Path) -> Table:
+    if stream.head.startswith(b"PAR1") or path.suffix.lower() in {".parquet", ".pq"}:
+        from accelcal_cli.sensor.parquet import ParquetTable
+
+        return ParquetTable(stream)
+    return TextTable(stream)
