@@ -1,0 +1,133 @@
+"""YAML files to frozen dataclasses: the only place that reads or writes YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.errors import ConfigError, did_you_mean
+from accelcal_cli.registry import build
+from accelcal_cli.sensor.simulation import Sensor
+
+CONFIGS = Path(__file__).parent / "configs"
+"""The shipped configurations, inside the installed package."""
+
+if not CONFIGS.is_dir():  # a checkout keeps them beside the package
+    CONFIGS = Path(__file__).parent.parent / "configs"
+
+
+class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """A safe loader that refuses a key given twice: YAML itself would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is not text", key_node.start_mark
+                )
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f'key "{key}" is given twice', key_node.start_mark
+                )
+            seen.add(key)
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+def load_mapping(path: Path) -> dict[str, Any]:
+    """Return the mapping in a YAML (or JSON) file.
+
+    Raises:
+        ConfigError: unreadable, not UTF-8, not YAML (line and column named), a key twice, or not a mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+    try:
+        content = yaml.load(text, Loader=_UniqueKeys)  # noqa: S506 - a safe loader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise ConfigError(f"{path}{place}: {error.problem or 'not YAML'}") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ConfigError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
+    if not isinstance(content, Mapping):
+        raise ConfigError(f"{path}: expected keys and values (a YAML mapping)")
+    return dict(content)
+
+
+def dump(record: Mapping[str, Any]) -> str:
+    """Return a record as YAML text that reads back to the same record."""
+    text: str = yaml.dump(
+        record,
+        Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
+        sort_keys=False,
+        default_flow_style=None,
+        allow_unicode=True,
+        width=110,
+    )
+    return text
+
+
+def shipped(kind: str) -> dict[str, Path]:
+    """Return the shipped files of a kind ("optimizers", "sensors", "studies") by name."""
+    return {path.stem: path for path in sorted((CONFIGS / kind).glob("*.yaml"))}
+
+
+def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
+    """Return the settings of a calibration: shipped defaults, then a file, then the command line.
+
+    Args:
+        path: the file of `--config`, or None.
+        overrides: what the command line states; `parameters` holds settings of the optimizer.
+
+    Raises:
+        ConfigError: the file cannot be read or says something that is not known.
+    """
+    where = str(path) if path else "command line"
+    stated = load_mapping(path) if path else {}
+    stated.pop("source", None)  # documentation: the paper the numbers come from
+    merged = {**stated, **overrides}
+    name = merged.get("optimizer", Settings.optimizer)
+    own = stated.get("parameters") or {}
+    if not isinstance(own, Mapping):
+        raise ConfigError(f"{where}: parameters: expected a mapping of keys, not {own!r}")
+    if stated.get("optimizer", name) != name:
+        own = {}  # the file's parameters belong to the optimizer that the command line replaced
+    parameters = {**_shipped_parameters(name), **own, **overrides.get("parameters", {})}
+    settings = build(Settings, {**merged, "parameters": parameters}, where)
+    settings.build_optimizer()
+    return settings
+
+
+def _shipped_parameters(optimizer: Any) -> dict[str, Any]:
+    files = shipped("optimizers")
+    if optimizer not in files:
+        return {}
+    parameters: dict[str, Any] = load_mapping(files[optimizer]).get("parameters") or {}
+    return parameters
+
+
+def load_sensor(name: str) -> Sensor:
+    """Return a sensor by the name of a shipped configuration or by the path of a file.
+
+    Raises:
+        ConfigError: neither such a configuration nor such a file, or one that says something unknown.
+    """
+    files = shipped("sensors")
+    path = files.get(name, Path(name))
+    if name not in files and not path.suffix:
+        raise ConfigError(
+            f'unknown sensor "{name}"{did_you_mean(name, files)}; known: {", ".join(files)}, or the path of a '
+            "YAML file"
+        )
+    return build(Sensor, load_mapping(path), str(path))

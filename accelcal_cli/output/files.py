@@ -1,0 +1,63 @@
+"""Files written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from accelcal_cli.errors import OutputError
+
+
+def check_target(path: str) -> None:
+    """Raise OutputError when `path` cannot be written, before any work is done for it."""
+    if path == "-":
+        return
+    target = Path(path)
+    if target.is_dir():
+        raise OutputError(f"{path}: is a directory; expected the name of a file")
+    folder = target.parent
+    if not folder.is_dir():
+        raise OutputError(f"{path}: no such folder: {folder}")
+    if not os.access(folder, os.W_OK) or (target.exists() and not os.access(target, os.W_OK)):
+        raise OutputError(f"{path}: permission denied")
+
+
+@contextmanager
+def whole_file(path: str) -> Iterator[IO[str]]:
+    """Open a text file that appears under its name only when all of it was written; "-" is standard output.
+
+    Raises:
+        OutputError: it cannot be written (folder, permission, full disk); nothing is left behind.
+    """
+    if path == "-":
+        yield sys.stdout
+        return
+    check_target(path)
+    target = Path(path)
+    temporary = ""
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        with open(handle, "w", encoding="utf-8", newline="\n") as file:
+            yield file
+        os.chmod(temporary, _mode(target))
+        os.replace(temporary, target)
+        temporary = ""
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+    finally:
+        if temporary:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def _mode(target: Path) -> int:
+    """Return the mode of the file that is replaced, or what the umask gives a new one."""
+    if target.exists():
+        return target.stat().st_mode & 0o7777
+    mask = os.umask(0)
+    os.umask(mask)
+    return 0o666 & ~mask

@@ -1,0 +1,88 @@
+"""A sensor of known errors, and the readings it would give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.errors import ConfigError
+from accelcal_cli.registry import check, setting
+from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.streams import Float, Streams
+
+NOISE_PURPOSE, ATTITUDE_PURPOSE = 2, 3
+"""Streams of the noise and of random attitudes."""
+
+Row = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How sensors of one type differ: one-sigma of their errors."""
+
+    scale: float = setting(0.0, "scale factor, part of nominal", low=0, high=0.2)
+    misalignment: float = setting(0.0, "misalignment, rad", low=0, high=0.2)
+    bias: float = setting(0.0, "bias, m/s^2", low=0, high=50)
+
+    def __post_init__(self) -> None:
+        """Refuse a spread outside its range."""
+        check(self)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor configuration: its true errors, its noise, and how its type spreads."""
+
+    name: str = setting("", "what it is")
+    source: str = setting("", "where the numbers come from")
+    unit: str = setting("", "unit of the output")
+    K_a: tuple[Row, Row, Row] = setting(None, "pulse-equivalent matrix, output units per m/s^2")
+    D_a: Row = setting((0.0, 0.0, 0.0), "bias, output units")
+    noise: float = setting(0.0, "noise of one sample and axis, one sigma, m/s^2", low=0, high=100)
+    spread: Spread = Spread()
+
+    def __post_init__(self) -> None:
+        """Refuse a sensor without an invertible matrix."""
+        check(self)
+        if self.K_a is None:
+            raise ConfigError("K_a: missing; expected three rows of three numbers")
+        if not np.isfinite(self.K_a).all() or abs(np.linalg.det(np.array(self.K_a))) == 0:
+            raise ConfigError("K_a: singular; expected an invertible matrix of finite numbers")
+
+    @property
+    def model(self) -> ErrorModel:
+        """Its error model."""
+        return ErrorModel(np.array(self.K_a), np.array(self.D_a))
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Simulated static samples.
+
+    Attributes:
+        pose: number of the pose of each sample, from 1, shape (n,).
+        output: N, output units, shape (n, 3).
+        force: true specific force, m/s^2, shape (n, 3).
+    """
+
+    pose: Float
+    output: Float
+    force: Float
+
+
+def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, seed: int) -> Simulated:
+    """Return what a sensor at rest reads.
+
+    Args:
+        sensor: the sensor.
+        u: unit directions of the specific force, shape (J, 3).
+        g: local gravity, m/s^2.
+        samples: samples of each pose.
+        noise: one sigma of one sample and axis, m/s^2.
+        seed: of the noise.
+    """
+    force = np.repeat(g * u, samples, axis=0)
+    disturbance = Streams(seed, [0], purpose=NOISE_PURPOSE).normal(len(force), 3)[0]
+    output = sensor.model.output(force + noise * disturbance)
+    return Simulated(np.repeat(np.arange(1, len(u) + 1), samples), output, force)
