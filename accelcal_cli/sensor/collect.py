@@ -29,9 +29,10 @@ class Extent:
     def add(self, output: Floats) -> None:
         """Add rows (B, 3)."""
         self.rows += len(output)
-        self.lower = np.minimum(self.lower, output.min(axis=0))
-        self.upper = np.maximum(self.upper, output.max(axis=0))
-        self.mean = self.mean + (output - self.mean).sum(axis=0) / self.rows
+        self.lower = np.minimum(self.lower, [axis.min() for axis in output.T])
+        self.upper = np.maximum(self.upper, [axis.max() for axis in output.T])
+        step = np.array([axis.mean() for axis in output.T]) - self.mean
+        self.mean = self.mean + step * (len(output) / self.rows)
 
     @property
     def stuck(self) -> bool:

@@ -10,10 +10,7 @@ AXES = "xyz"
 _BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
 _INDEX = re.compile(r"\[([012])\]\s*$")  # accelerometer_m_s2[0]
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
-_UNITS = frozenset(
-    ["g", "mg", "ug", "mps", "mps2", "ms", "ms2", "m", "s", "s2", "2", "lsb", "counts", "raw"]
-    + ["mv", "v", "c", "degc", "celsius", "k", "pulse", "pulses", "hz"]
-)
+_UNITS = re.compile(r"g|mg|ug|mps|mps2|ms|ms2|m|s|s2|2|lsb|counts|raw|mv|v|c|degc|celsius|k|pulse|pulses|hz")
 _CAPITAL_T = re.compile(r"T(?:_?(?:deg)?[cCkK]|\s*[\[(]\s*(?!m?s\b).*)?")  # t would be time
 _MEAN = frozenset({"mean", "avg", "average"})
 _SPREAD = frozenset({"std", "sd", "sigma", "stdev", "stddev"})
@@ -22,15 +19,12 @@ _SPREAD_GLUED = re.compile(r"(?:std|sd|sigma|s)([xyz])")
 _ACCELERATION = ("acc", "accel", "acceleration", "accelerometer", "linearacceleration")
 _OUTPUT = ("a", *_ACCELERATION, "fieldlinearacceleration", "accsmooth", "n", "out", "output", "")
 _REFERENCE = ("f", "ref", "reference", "fref", "reff", "specificforce")
-_LABEL = frozenset(
-    ["pose", "poses", "poseid", "poselabel", "posename", "position", "positionid", "pos", "label"]
-    + ["orientation", "face"]
-)
+_LABEL = re.compile(r"pose|poses|poseid|poselabel|posename|position|positionid|pos|label|orientation|face")
 _COUNT = frozenset({"n", "count", "counts", "samples", "nsamples", "numsamples", "npoints"})
 _TEMPERATURE = frozenset({"temperature", "temp"})
-_OTHER = frozenset(
-    ["t", "time", "timestamp", "stamp", "start", "end", "stop", "tstart", "tend", "starttime", "endtime"]
-    + ["index", "row", "sec", "seconds", "id"]
+_OTHER = re.compile(
+    r"t|time|timestamp|stamp|start|end|stop|tstart|tend|starttime|endtime|index|row|sec|"
+    r"seconds|id"
 )
 
 
@@ -54,7 +48,7 @@ def tokens_of(name: str) -> list[str]:
     name = _INDEX.sub(lambda found: "_" + AXES[int(found[1])], name)
     words = re.split(r"[^a-z0-9]+", _CAMEL.sub("_", _BRACKETS.sub(" ", name)).lower())
     words = [word for word in words if word]
-    while len(words) > 1 and words[-1] in _UNITS:
+    while len(words) > 1 and _UNITS.fullmatch(words[-1]):
         words.pop()
     return [word for word in words if word not in _MEAN] or words
 
@@ -89,11 +83,11 @@ def _single(roles: Roles, column: int, name: str, key: str) -> bool:
     """Settle a column that stands alone; of two of a kind the first counts."""
     if key in _TEMPERATURE or _CAPITAL_T.fullmatch(name.strip()):
         roles.temperature = column if roles.temperature is None else roles.temperature
-    elif key in _LABEL:
+    elif _LABEL.fullmatch(key):
         roles.label = column if roles.label is None else roles.label
     elif key in _COUNT:
         roles.count = column if roles.count is None else roles.count
-    elif key in _OTHER or not key:
+    elif _OTHER.fullmatch(key) or not key:
         roles.other.add(column)
     else:
         return False

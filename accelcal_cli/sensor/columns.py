@@ -60,14 +60,10 @@ def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
 
 
 def _stated(table: Table, wanted: Sequence[str]) -> Triple:
-    words = (
-        [word.strip() for part in wanted for word in str(part).split(",")]
-        if len(wanted) == 1
-        else list(wanted)
-    )
+    words = [word.strip() for word in (wanted[0].split(",") if len(wanted) == 1 else wanted)]
     if len(words) != 3:
         raise UsageError(f"--columns: three columns were expected (x, y, z), not {len(words)}")
-    found = [_column(table, str(word).strip()) for word in words]
+    found = [_column(table, word) for word in words]
     for k, column in enumerate(found):
         if column in found[:k]:
             raise UsageError(f'--columns: column "{words[k]}" is asked for twice')
@@ -80,9 +76,9 @@ def _column(table: Table, word: str) -> int:
     for fold in (str, str.lower):
         matches = [k for k, name in enumerate(names or ()) if fold(name) == fold(word)]
         if len(matches) > 1:
-            numbers = " and ".join(str(k + 1) for k in matches)
+            numbers = " or ".join(str(k + 1) for k in matches)
             raise UsageError(
-                f'--columns: "{word}" could be columns {numbers} of {table.name}; give the number'
+                f'--columns: "{word}" could be column {numbers} of {table.name}; give the number'
             )
         if matches:
             return matches[0]
@@ -103,9 +99,7 @@ def _nameless(table: Table) -> Triple:
     if width == 3:
         return 0, 1, 2
     if width < 3:
-        raise DataError(
-            f"{table.name}: has {width} column{'s' * (width != 1)} where three (x, y, z) were expected"
-        )
+        raise DataError(f"{table.name}: has {_plural(width)} where three (x, y, z) were expected")
     raise DataError(
         f"{table.name}: has {width} columns and no header; say which three are x, y, z, as in --columns 1,2,3"
     )
@@ -126,7 +120,7 @@ def _only_numeric(table: Table, names: Sequence[str], roles: Roles) -> Triple:
     if len(left) == 3:
         return left[0], left[1], left[2]
     if len(names) < 3:
-        raise DataError(f"{table.name}: has {len(names)} column(s) where three (x, y, z) were expected")
+        raise DataError(f"{table.name}: has {_plural(len(names))} where three (x, y, z) were expected")
     raise DataError(
         f"{table.name}: no column names such as ax, ay, az; say which columns are x, y, z with --columns "
         f"(there are {_listed(names, range(len(names)))})"
@@ -171,3 +165,7 @@ def _scatter_of(names: Sequence[str] | None, output: Triple, roles: Roles) -> Tr
 def _listed(names: Sequence[str], columns: Sequence[int]) -> str:
     listed = ", ".join(f'"{names[k]}"' for k in columns[:20])
     return listed + (f" and {len(columns) - 20} more" if len(columns) > 20 else "")
+
+
+def _plural(columns: int) -> str:
+    return f"{columns} column{'s' * (columns != 1)}"

@@ -126,10 +126,9 @@ def _separator(lines: list[str]) -> str:
     if not any("," in line for line in bare):
         return " "
     comma = _numeric_share(cell for line in bare for cell in line.split(","))
+    words = (cell for line in bare for cell in line.split())
     blank = _numeric_share(
-        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
-        for line in bare
-        for cell in line.split()
+        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in words
     )
     return " " if blank > comma else ","
 

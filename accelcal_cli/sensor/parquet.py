@@ -73,9 +73,8 @@ class ParquetTable:
 
     def _copy(self) -> Path:
         try:
-            copy = self._files.enter_context(
-                tempfile.NamedTemporaryFile(prefix="accelcal-", suffix=".parquet")
-            )
+            copy = tempfile.NamedTemporaryFile(prefix="accelcal-", suffix=".parquet")  # noqa: SIM115
+            self._files.enter_context(copy)
             copy.write(self._source.head)
             for block in self._source.rest():
                 copy.write(block)

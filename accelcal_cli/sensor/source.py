@@ -6,12 +6,10 @@ import hashlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from accelcal_cli.errors import DataError, did_you_mean
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future, ThreadPoolExecutor
+from accelcal_cli.sensor.beside import Beside
 
 HEAD = 4 << 20  # bytes: an input up to this size is one block and never needs polars
 BLOCK = 16 << 20  # bytes of a later block
@@ -40,8 +38,7 @@ class ByteSource:
         self._stream = stream
         self._block = block
         self._hash = hashlib.sha256()
-        self._pool: ThreadPoolExecutor | None = None
-        self._pending: Future[None] | None = None
+        self._hashing = Beside()
         raw = self._read(head)
         self.whole = len(raw) < head  # the head is all there is
         self._hash.update(raw)
@@ -52,17 +49,14 @@ class ByteSource:
                 raise DataError(f"{name}: is {what}")
 
     def close(self) -> None:
-        """Stop the hashing thread and close the file (standard input stays open)."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        """Close the file (standard input stays open)."""
         if self._stream is not sys.stdin.buffer:
             self._stream.close()
 
     @property
     def sha256(self) -> str:
         """Hexadecimal SHA-256 of the bytes read so far."""
-        if self._pending is not None:
-            self._pending.result()
+        self._hashing.wait()
         return self._hash.hexdigest()
 
     def blocks(self) -> Iterator[bytes]:
@@ -71,18 +65,18 @@ class ByteSource:
         Only the last block may lack its line end, and one with a line longer than `LONGEST_LINE`: that line
         comes cut, for the parser to refuse by its number.
         """
-        data, more = self.head, not self.whole
-        while more:
-            cut = data.rfind(b"\n") + 1
-            if len(data) - cut > LONGEST_LINE:
-                break
+        rest, fresh = b"", self.head
+        while fresh and not self.whole:
+            cut = fresh.rfind(b"\n") + 1
             if cut:
-                yield data[:cut]
+                yield b"".join((rest, memoryview(fresh)[:cut]))
+                rest = b""
+            rest += fresh[cut:]
+            if len(rest) > LONGEST_LINE:
+                break
             fresh = self._next()
-            more = bool(fresh)
-            data = data[cut:] + fresh
-        if data:
-            yield data
+        if rest or self.whole:
+            yield rest or self.head
 
     def rest(self) -> Iterator[bytes]:
         """Every byte after the head, uncut (for binary formats)."""
@@ -92,17 +86,8 @@ class ByteSource:
     def _next(self) -> bytes:
         raw = self._read(self._block)
         if raw:
-            self._hash_beside(raw)
+            self._hashing.start(lambda: self._hash.update(raw))
         return self._unify(raw)
-
-    def _hash_beside(self, raw: bytes) -> None:
-        if self._pool is None:
-            from concurrent.futures import ThreadPoolExecutor  # small inputs do without
-
-            self._pool = ThreadPoolExecutor(1)
-        if self._pending is not None:
-            self._pending.result()
-        self._pending = self._pool.submit(self._hash.update, raw)
 
     def _unify(self, raw: bytes) -> bytes:
         return raw.replace(b"\r", b"\n") if self._carriage_returns else raw

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.beside import Beside
 
 IN_MEMORY = 1_000_000  # rows
 
@@ -29,6 +30,7 @@ class RowStore:
         self._limit = limit
         self._parts: list[NDArray[np.float64]] = []
         self._file: BinaryIO | None = None
+        self._writing = Beside()
 
     def append(self, rows: NDArray[np.float64]) -> None:
         """Add rows (B, width)."""
@@ -37,11 +39,13 @@ class RowStore:
         self._parts.append(np.array(rows, dtype=np.float64, order="C"))
         self.rows += len(rows)
         if self.rows > self._limit:
+            parts, self._parts = self._parts, []
             with _named_disk_errors():
-                self._spill()
+                self._writing.start(lambda: self._spill(parts))
 
     def blocks(self, rows: int = 65536) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """Yield (first row, block) with blocks of up to `rows` rows; blocks are read-only or private."""
+        self._settle()
         if self._file is None:
             whole = self._in_memory()
             for start in range(0, self.rows, rows):
@@ -56,6 +60,7 @@ class RowStore:
 
     def all(self) -> NDArray[np.float64]:
         """Every row, (rows, width)."""
+        self._settle()
         if self._file is None:
             return self._in_memory()
         return np.concatenate([block for _, block in self.blocks()])
@@ -66,17 +71,20 @@ class RowStore:
         self._parts[0].flags.writeable = False
         return self._parts[0]
 
-    def _spill(self) -> None:
+    def _settle(self) -> None:
+        with _named_disk_errors():
+            self._writing.wait()
+
+    def _spill(self, parts: list[NDArray[np.float64]]) -> None:
         if self._file is None:
             import tempfile  # costs as much as reading a small table
 
             self._file = tempfile.TemporaryFile(prefix="accelcal-", buffering=0)  # noqa: SIM115
         self._file.seek(0, os.SEEK_END)
-        for part in self._parts:
+        for part in parts:
             view = part.data.cast("B")
             while view:  # an unbuffered write may take less than all
                 view = view[self._file.write(view) :]
-        self._parts.clear()
 
     def _fill(self, block: NDArray[np.float64]) -> None:
         view = block.data.cast("B")

@@ -70,7 +70,11 @@ class TextTable:
         self._lines = careful.lines
         parse = careful.parse if self._source.whole else FastParser(careful).parse
         for block in self._source.blocks():
-            yield parse(block)
+            top = _top(block, self.dialect.header_line) if careful.line == 0 else 0
+            if top:
+                yield careful.parse(block[:top])
+            if top < len(block):
+                yield parse(block[top:])
 
     def where(self, row: int) -> str:
         """Line of a row."""
@@ -97,3 +101,11 @@ def _table(stream: ByteSource, path: Path) -> Table:
 
         return ParquetTable(stream)
     return TextTable(stream)
+
+
+def _top(block: bytes, header_line: int) -> int:
+    """Bytes of the lines up to the header, or of the first line."""
+    end = 0
+    for _ in range(max(header_line, 1)):
+        end = block.find(b"\n", end) + 1 or len(block)
+    return end
