@@ -90,6 +90,8 @@ def convert(value: Any, hint: Any, label: str) -> Any:
                 f"{did_you_mean(str(value), map(str, arguments))}"
             )
         return value
+    if origin is dict and isinstance(value, Mapping):
+        return dict(value)
     if origin is tuple:
         return _sequence(value, arguments, label)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):

@@ -10,13 +10,15 @@ Arrays come out as (R, P, D) with the population axis contiguous in memory: oper
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.random import SFC64, Generator, SeedSequence
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating[Any]]
 Int = NDArray[np.intp]
+Bool = NDArray[np.bool_]
 
 
 class Streams:

@@ -73,6 +73,7 @@ def assemble(
         noise_chance=chance,
         covariance=covariance,
         nominal_scale=np.diagonal(before_model.K).copy(),
+        nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=readings.poses,
         evaluations=solution.evaluations,
         runs=settings.runs,
@@ -124,12 +125,17 @@ def _before(start: Start, settings: Settings) -> tuple[str, ErrorModel]:
         return "the stated nominal sensor", ErrorModel(
             np.diag(settings.nominal.scale), np.array(settings.nominal.bias)
         )
-    scale = float(centre[:3].mean())
-    if 0.8 < scale < 1.25:
+    scale = _round(float(centre[:3].mean()))
+    if 0.8 < scale < 1.25:  # specific force already, in m/s^2 or in g
         return "the readings as they are", ErrorModel(np.eye(3), np.zeros(3))
     return "one scale factor for all axes and the estimated bias, no misalignment", ErrorModel(
         scale * np.eye(3), centre[-3:]
     )
+
+
+def _round(value: float) -> float:
+    """Return a value to three significant digits: a nominal scale factor carries no more."""
+    return float(f"{value:.3g}")
 
 
 def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple[float | None, float | None]:

@@ -61,7 +61,7 @@ def compress(blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale:
         centre: c, shape (3,); scale: s. Any values serve; near the middle and the radius of the readings they
             keep the arithmetic free of cancellation.
     """
-    R = np.zeros((11, 11))
+    R: Float = np.zeros((11, 11))
     poses = 0
     for block, weight in blocks:
         poses += len(block)
@@ -95,5 +95,5 @@ def _pieces(table: Float) -> Float:
 
 def _triangle(table: Float) -> Float:
     """Return R of the QR of (..., rows >= 11, 11), shape (..., 11, 11)."""
-    R: Float = np.linalg.qr(table, mode="r")
+    R: Float = np.linalg.qr(table, mode="r")  # type: ignore[assignment]  # numpy types mode "r" as "reduced"
     return R

@@ -87,7 +87,8 @@ class Loetters(Problem):
         r = self._R @ self._quadratic(x)
         r -= self._t
         r *= r
-        return np.add.reduce(r, axis=1) * self.g**4
+        cost: Float = np.add.reduce(r, axis=1) * self.g**4
+        return cost
 
     def residuals(self, x: Float) -> Float:
         """Return the 11 compressed residuals in (m/s^2)^2, shape (R, P, 11)."""
@@ -140,7 +141,8 @@ class Loetters(Problem):
         first, second = PAIRS
         products = M.take(first, axis=1)
         products *= M.take(second, axis=1)
-        return np.add.reduce(products, axis=2)
+        q: Float = np.add.reduce(products, axis=2)
+        return q
 
 
 def _quadratic_change(M: Float, dM: Float) -> Float:

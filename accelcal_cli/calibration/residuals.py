@@ -10,7 +10,7 @@ import numpy as np
 from accelcal_cli.calibration.quality import design
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Float
+from accelcal_cli.streams import Float, Int
 
 KEPT = 1000
 """Poses whose residuals a result keeps one by one; of more, the worst KEPT_WORST."""
@@ -33,7 +33,7 @@ class PoseResiduals:
         left_out: |f| - g, m/s^2, that a fit without the pose would show, shape (k,), to first order.
     """
 
-    pose: Float
+    pose: Int
     error: Float
     leverage: Float
     studentised: Float
@@ -83,7 +83,7 @@ def examine(
         freedom: J - 9; studentised residuals need at least 2.
     """
     square_sum, weighted_sum = 0.0, 0.0
-    parts: list[tuple[Float, ...]] = []
+    parts: list[tuple[Int, Float, Float, Float]] = []
     for first, e, u in modulus_errors(readings, model, g):
         w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
         rows = design(u)
@@ -110,7 +110,7 @@ def examine(
     )
 
 
-def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Float:
+def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:
     """Return the pose numbers whose studentised residual is beyond chance (Student t, Bonferroni)."""
     if freedom < 2:
         return residuals.pose[:0]
@@ -122,12 +122,13 @@ def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Float:
     from scipy.special import stdtr
 
     chance = 2.0 * poses * stdtr(freedom - 1, -size)
-    return residuals.pose[suspect & (chance < OUTLIER_LEVEL)]
+    named: Int = residuals.pose[suspect & (chance < OUTLIER_LEVEL)]
+    return named
 
 
 def _keep(
-    pose: Float, error: Float, leverage: Float, scaled: Float, poses: int
-) -> tuple[Float, Float, Float, Float]:
+    pose: Int, error: Float, leverage: Float, scaled: Float, poses: int
+) -> tuple[Int, Float, Float, Float]:
     if poses > KEPT and len(pose) > KEPT_WORST:
         worst = np.argpartition(-np.abs(scaled), KEPT_WORST)[:KEPT_WORST]
         return pose[worst], error[worst], leverage[worst], scaled[worst]

@@ -75,7 +75,8 @@ class Calibration:
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9).
-        nominal_scale: what scale-factor errors are relative to, output units per m/s^2, shape (3,).
+        nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
+            units, shape (3,): the stated nominal sensor, or round numbers and no bias.
         poses: J; freedom: J - 9.
         evaluations: of the cost, search and polish together.
         runs, runs_agreeing: searches made, and how many ended in the best one's minimum.
@@ -107,6 +108,7 @@ class Calibration:
     noise_chance: float | None
     covariance: Float
     nominal_scale: Float
+    nominal_bias: Float
     poses: int
     evaluations: int
     runs: int
@@ -155,7 +157,7 @@ class Calibration:
             raise DataError(f"{where}: not a calibration result: {error}") from None
 
 
-ARRAYS = ("K_a", "D_a", "K_A", "f_0", "covariance", "nominal_scale")
+ARRAYS = ("K_a", "D_a", "K_A", "f_0", "covariance", "nominal_scale", "nominal_bias")
 NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
 
 
@@ -166,9 +168,13 @@ def _rebuild(name: str, value: Any) -> Any:
         return Sigma(_array(value["K_a"]), _array(value["D_a"]))
     if name == "dop":
         parameters = {key: _infinite(v) for key, v in value["parameters"].items()}
-        return Dop(*(_infinite(value[k]) for k in ("misalignment", "scale", "bias", "worst")), parameters)
+        kinds = {kind: _infinite(value[kind]) for kind in ("misalignment", "scale", "bias", "worst")}
+        return Dop(**kinds, parameters=parameters)
     if name == "poses_fit":
-        return tuple(PoseFit(**{k: math.nan if v is None else v for k, v in row.items()}) for row in value)
+        rows: list[dict[str, Any]] = [
+            {k: math.nan if v is None else v for k, v in row.items()} for row in value
+        ]
+        return tuple(PoseFit(**row) for row in rows)
     if name == "convergence":
         return tuple((int(n), float(cost)) for n, cost in value)
     if name in NUMBERS_OR_NAN:

@@ -14,7 +14,7 @@ import numpy as np
 from accelcal_cli.optimizers.base import CONVERGED, FAILED, OPTIMIZERS, RUNNING, Optimizer, State
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Bool, Float, Streams
 
 
 @dataclass(frozen=True)
@@ -103,17 +103,18 @@ def _normal_equations(problem: Problem, x: Float, r: Float) -> tuple[Float, Floa
     return transposed @ jacobian, (transposed @ r[..., None])[..., 0]
 
 
-def _solve(state: DampedState, held: Float) -> Float:
+def _solve(state: DampedState, held: Bool) -> Float:
     """Return the step (J^T J + lambda diag(J^T J))^-1 (-J^T r) with the held coordinates at rest."""
     scale = np.einsum("rpdd->rpd", state.normal)
     # A floor keeps a coordinate without influence (a pose set that says nothing of it) from dividing by zero.
     scale = np.maximum(scale, 1e-12 * scale.max(axis=2, keepdims=True))
-    free = ~held
-    matrix = state.normal * (free[..., :, None] & free[..., None, :])
+    free: Bool = np.logical_not(held)
+    pairs: Bool = free[..., :, None] & free[..., None, :]
+    matrix = state.normal * pairs
     diagonal = np.where(held, 1.0, np.einsum("rpdd->rpd", matrix) + state.damping[..., None] * scale)
     index = np.arange(matrix.shape[-1])
     matrix[..., index, index] = diagonal
-    usable = np.isfinite(matrix).all(axis=(2, 3)) & np.isfinite(state.gradient).all(axis=2)
+    usable: Bool = np.isfinite(matrix).all(axis=(2, 3)) & np.isfinite(state.gradient).all(axis=2)
     matrix = np.where(usable[..., None, None], matrix, np.eye(len(index)))
     right = np.where(held | ~usable[..., None], 0.0, -state.gradient)
     step: Float = np.linalg.solve(matrix, right[..., None])[..., 0]

@@ -111,7 +111,8 @@ def directions(count: int, scheme: str | None, random: Float) -> Float:
     if scheme == "fibonacci":
         return fibonacci(count)
     if scheme == "random":
-        return random / np.linalg.norm(random, axis=1, keepdims=True)
+        unit: Float = random / np.linalg.norm(random, axis=1, keepdims=True)
+        return unit
     rows = FIXED[scheme]()
     if len(rows) != count:
         raise UsageError(

@@ -1,0 +1,195 @@
+"""A calibration as tables: what it shows, in the paper's units and in an engineer's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from accelcal_cli.calibration.quality import UNDETERMINED, WEAK
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.sensor import units
+from accelcal_cli.sensor.poses import AXES
+from accelcal_cli.table import Column, Table
+
+WORST_SHOWN = 5
+UNKNOWN = "not determined"
+
+
+def tables(result: Calibration) -> list[Table]:
+    """Return every table of a result, in reading order."""
+    return [parameters(result), engineering(result), fit(result), observability(result), worst_poses(result)]
+
+
+def parameters(result: Calibration) -> Table:
+    """Return K_a and D_a with their one-sigma."""
+    rows = []
+    for i in range(3):
+        row: list[object] = [AXES[i]]
+        for j in range(3):
+            row += _pair(result, result.K_a[i, j], result.sigma.K_a[i, j])
+        row += _pair(result, result.D_a[i], result.sigma.D_a[i])
+        rows.append(row)
+    columns = [Column("axis")]
+    for name in ("K_x", "K_y", "K_z", "bias"):
+        columns += [Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}")]
+    notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
+    if result.gauge == "full":
+        notes.append(
+            "In gauge full a rotation of the body frame is free: of the off-diagonals only K_12/K_11 + K_21/K_22, "
+            "K_13/K_11 + K_31/K_33 and K_23/K_22 + K_32/K_33 are observable, and they alone have a sigma "
+            "(next table)."
+        )
+    return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
+
+
+def _pair(result: Calibration, value: float, sigma: float) -> list[object]:
+    """Return a value and its sigma; a value that the poses do not determine is not shown as one."""
+    if np.isfinite(sigma):
+        return [value, sigma]
+    if result.verdict == "undetermined" and result.gauge != "full":
+        return [UNKNOWN, None]
+    return [value, None]
+
+
+def engineering(result: Calibration) -> Table:
+    """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
+    # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
+    metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
+    sigma = np.sqrt(np.diagonal(result.covariance))
+    scale = units.scale_error(result.K_a, result.nominal_scale)
+    angle = units.misalignment(result.K_a)
+    bias = units.bias_force(result.K_a, result.D_a - result.nominal_bias)
+    rows = [_row(f"scale factor error {AXES[i]}", scale[i], sigma[i] / per_g, "ppm", "%") for i in range(3)]
+    for p, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        value = angle[i, j] + angle[j, i]
+        rows.append(_row(f"misalignment {AXES[i]}{AXES[j]}", value, sigma[3 + p] / per_g, "mrad", "arcsec"))
+    for i in range(3):
+        row = _row(
+            f"bias {AXES[i]}", bias[i] / per_g, sigma[6 + i] / per_g, "micro-g", "m/s^2", metres * per_g
+        )
+        rows.append(row)
+    columns = (
+        Column("parameter"),
+        Column("value", format=",.1f"),
+        Column("sigma", format=",.1f"),
+        Column("unit"),
+        Column("value", format=".5f", key="value_2"),
+        Column("sigma", format=".5f", key="sigma_2"),
+        Column("unit", key="unit_2"),
+    )
+    return Table("Engineering view", columns, tuple(rows), (_reference(result),))
+
+
+def _row(
+    name: str, value: float, sigma: float, unit: str, second: str, force: float = 1.0
+) -> tuple[object, ...]:
+    """Return one row: value and sigma in two units; `force` is what one g is in the second unit of a bias."""
+    first_factor = {"ppm": units.PPM, "mrad": units.MRAD, "micro-g": units.MICRO_G}[unit]
+    second_factor = {"%": 100.0, "arcsec": units.ARCSEC, "m/s^2": force}[second]
+    if not np.isfinite(sigma):
+        return (name, UNKNOWN, None, unit, UNKNOWN, None, second)
+    return (
+        name,
+        value * first_factor,
+        sigma * first_factor,
+        unit,
+        value * second_factor,
+        sigma * second_factor,
+        second,
+    )
+
+
+def _reference(result: Calibration) -> str:
+    """Return the sentence that says what the engineering numbers are relative to."""
+    nominal = f"{result.nominal_scale[0]:.6g}"
+    if np.ptp(result.nominal_scale) > 0:
+        nominal = ", ".join(f"{k:.6g}" for k in result.nominal_scale)
+    offset = ", ".join(f"{d:g}" for d in result.nominal_bias) if result.nominal_bias.any() else "0"
+    return (
+        f"Scale-factor errors against {nominal} output units per {result.unit}, biases against {offset} output units. "
+        "Misalignment: the angle by which two sensor axes miss 90 degrees."
+    )
+
+
+def fit(result: Calibration) -> Table:
+    """Return how well the readings fit."""
+    unit = result.unit
+    rows: list[tuple[object, ...]] = [
+        ("rms of |f| - g before", f"{result.rms_before:.6g}", unit),
+        ("rms of |f| - g after", f"{result.rms:.6g}", unit),
+        ("noise of one pose, s", f"{result.s:.6g}" if result.freedom > 0 else "-", unit),
+        ("poses", str(result.poses), ""),
+        ("degrees of freedom", str(result.freedom), ""),
+        (f"cost L after {result.optimizer}", f"{result.cost_search:.9g}", f"({unit})^4"),
+        ("cost L after polish", f"{result.cost:.9g}", f"({unit})^4"),
+        ("evaluations", f"{result.evaluations:,}", ""),
+        ("searches in this minimum", f"{result.runs_agreeing} of {result.runs}", ""),
+        ("local gravity g", f"{result.g:.7g}", unit),
+    ]
+    if not result.settings.get("polish", True):
+        rows.pop(6)
+    if result.noise_ratio is not None:
+        rows.insert(3, ("s over the scatter within poses", f"{result.noise_ratio:.3g}", ""))
+        rows.insert(4, ("chance of that ratio or more", f"{result.noise_chance:.2g}", ""))
+    notes = (f"Before: {result.before}.",)
+    return Table("Fit", (Column("quantity"), Column("value"), Column("unit")), tuple(rows), notes)
+
+
+def observability(result: Calibration) -> Table:
+    """Return the dilution of precision of each parameter."""
+    rows = []
+    for name, dop in result.dop.parameters.items():
+        word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
+        rows.append((name, dop if np.isfinite(dop) else "infinite", word))
+    notes = (
+        "Dilution of precision: how many times the noise of one pose the error of a parameter comes out "
+        f"(as {result.unit} at 1 g). Above {WEAK:g} weak, above {UNDETERMINED:g} undetermined.",
+    )
+    columns = (Column("parameter"), Column("DOP", format=".3f"), Column(""))
+    return Table("Observability", columns, tuple(rows), notes)
+
+
+def worst_poses(result: Calibration) -> Table:
+    """Return the poses with the largest studentised residuals, and those named as outliers."""
+    size = [abs(p.studentised) if np.isfinite(p.studentised) else abs(p.residual) for p in result.poses_fit]
+    order = np.argsort(-np.array(size), kind="stable")[:WORST_SHOWN]
+    rows = tuple(
+        (
+            p.where,
+            p.residual,
+            p.studentised,
+            p.leverage,
+            p.left_out,
+            "outlier" if p.pose in result.outliers else "",
+        )
+        for p in (result.poses_fit[i] for i in order)
+    )
+    unit = result.unit
+    columns = (
+        Column("pose"),
+        Column("|f| - g", unit, ".3e"),
+        Column("studentised", format=".2f"),
+        Column("leverage", format=".2f"),
+        Column("left out", unit, ".3e"),
+        Column(""),
+    )
+    return Table("Worst poses", columns, rows)
+
+
+def values(result: Calibration) -> Table:
+    """Return the parameters one a row, for CSV."""
+    unit = f"output units per {result.unit}"
+    rows: list[tuple[object, ...]] = [
+        (f"K_{i + 1}{j + 1}", result.K_a[i, j], result.sigma.K_a[i, j], unit)
+        for i in range(3)
+        for j in range(3)
+    ]
+    rows += [(f"D_{i + 1}", result.D_a[i], result.sigma.D_a[i], "output units") for i in range(3)]
+    rows += [
+        ("cost", result.cost, None, f"({result.unit})^4"),
+        ("rms", result.rms, None, result.unit),
+        ("g", result.g, None, result.unit),
+        ("verdict", result.verdict, None, ""),
+    ]
+    columns = (Column("parameter"), Column("value"), Column("sigma"), Column("unit"))
+    plain = [tuple(v.item() if isinstance(v, np.generic) else v for v in row) for row in rows]
+    return Table("Calibration", columns, tuple(plain))

@@ -1,0 +1,144 @@
+"""`accelcal calibrate`: readings in, K matrix, bias, their sigma and a verdict out."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from accelcal_cli.cli import options
+from accelcal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
+
+BAD_VERDICT = 1
+
+
+def command(
+    data: Annotated[
+        str, typer.Argument(help="CSV, text or Parquet file of static readings; - is standard input.")
+    ],
+    columns: Annotated[
+        str | None, typer.Option(help="The three output columns: names, or numbers from 1, with commas.")
+    ] = None,
+    g: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    optimizer: Annotated[str | None, typer.Option(help="Search method.", show_default="de-pso")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file: optimizer, its parameters, box, gauge, ...")
+    ] = None,
+    population: Annotated[int | None, typer.Option(help="Points of the search.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="Iterations of the search.")] = None,
+    runs: Annotated[int | None, typer.Option(help="Independent searches (multi-start).")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.", show_default="0")] = None,
+    gauge: Annotated[
+        str | None, typer.Option(help="lower, upper, symmetric or full.", show_default="lower")
+    ] = None,
+    robust: Annotated[
+        str | None, typer.Option(help="Loss: none, huber or soft-l1.", show_default="none")
+    ] = None,
+    weights: Annotated[
+        str | None, typer.Option(help="Weight of a pose: none, n or sd.", show_default="none")
+    ] = None,
+    polish: Annotated[
+        bool | None, typer.Option(help="Finish by Levenberg-Marquardt.", show_default="polish")
+    ] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="Exit 1 when the rms of |f| - g is above this (m/s^2).")
+    ] = None,
+    output: Annotated[
+        str | None, typer.Option("--output", "-o", help="Result file: .yaml or .json; - is standard output.")
+    ] = None,
+    format: options.Format = "table",
+    quiet: options.Quiet = False,
+) -> None:
+    """Calibrate an accelerometer from static readings.
+
+    Prints the K matrix and the bias with their uncertainty, how well the poses determine them, and a verdict.
+    Exit code 1 means that the verdict is "undetermined" or that --tolerance was missed.
+    """
+    from accelcal_cli.calibration.pipeline import calibrate
+    from accelcal_cli.config import load_settings
+    from accelcal_cli.sensor.readings import read_readings
+    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+
+    options.check_format(format)
+    _check_output(output, format)
+    stated_g = options.gravity(g, latitude, height)
+    overrides: dict[str, Any] = {
+        "optimizer": optimizer,
+        "g": stated_g,
+        "runs": runs,
+        "seed": seed,
+        "gauge": gauge,
+        "robust": robust,
+        "weights": weights,
+        "polish": polish,
+    }
+    parameters = {"population": population, "iterations": iterations}
+    stated = {k: v for k, v in overrides.items() if v is not None}
+    stated["parameters"] = {k: v for k, v in parameters.items() if v is not None}
+    settings = load_settings(config, stated)
+    readings = read_readings(data, _columns(columns), stdin=sys.stdin.buffer)
+    result = calibrate(readings, settings)
+    _show(result, format, output, quiet)
+    if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
+        typer.echo(
+            f"accelcal: g = {settings.g} assumed; state yours with --g or --latitude and --height "
+            "(scale factors are proportional to it)",
+            err=True,
+        )
+    if tolerance is not None and not result.rms <= tolerance:
+        typer.echo(f"accelcal: rms {result.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
+        raise typer.Exit(BAD_VERDICT)
+    if result.verdict == "undetermined":
+        raise typer.Exit(BAD_VERDICT)
+
+
+def _columns(text: str | None) -> list[str] | None:
+    return None if text is None else [part.strip() for part in text.split(",")]
+
+
+def _check_output(output: str | None, format: str) -> None:
+    if output is None:
+        return
+    if output == "-":
+        if format != "table":
+            raise UsageError(f"-o - prints the result file; leave out --format {format}")
+        return
+    if Path(output).suffix not in (".yaml", ".yml", ".json"):
+        raise UsageError(f'-o "{output}": expected a name that ends in .yaml, .yml or .json')
+    from accelcal_cli.output.files import check_target
+
+    check_target(output)
+
+
+def _show(result: Calibration, format: str, output: str | None, quiet: bool) -> None:
+    """Write the result file, then print the result in the chosen form."""
+    from accelcal_cli.output.plain import json_text, write_csv
+
+    if output is not None:
+        from accelcal_cli.config import dump
+        from accelcal_cli.output.files import whole_file
+
+        with whole_file(output) as file:
+            file.write(json_text(result.record()) if output.endswith(".json") else dump(result.record()))
+        if output == "-":
+            return
+    if format == "json":
+        sys.stdout.write(json_text(result.record()))
+    elif format == "csv":
+        from accelcal_cli.calibration.tables import values
+
+        write_csv(values(result), sys.stdout)
+    else:
+        from accelcal_cli.output.calibration import show_calibration
+
+        show_calibration(result)
+    sys.stdout.flush()
+    if output is not None and not quiet:
+        typer.echo(f"accelcal: wrote {output}", err=True)

@@ -1,0 +1,53 @@
+"""Options that several commands share, and the checks on them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from accelcal_cli.errors import UsageError, did_you_mean
+
+FORMATS = ("table", "json", "csv")
+
+Format = Annotated[str, typer.Option("--format", help="What to print: table, json or csv.", metavar="FORMAT")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers.", min=0)]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing on standard error but errors.")]
+Gravity = Annotated[
+    float | None,
+    typer.Option(
+        "--g", help="Local gravity in m/s^2 (1 for readings in units of g).", show_default="9.80665"
+    ),
+]
+Latitude = Annotated[
+    float | None, typer.Option("--latitude", help="Degrees; gravity from WGS84 instead of --g.")
+]
+Height = Annotated[
+    float | None, typer.Option("--height", help="Metres above the ellipsoid, with --latitude.")
+]
+
+
+def check_format(choice: str) -> str:
+    """Return a known output format or raise UsageError."""
+    if choice not in FORMATS:
+        raise UsageError(
+            f'--format "{choice}": unknown{did_you_mean(choice, FORMATS)}; expected one of {", ".join(FORMATS)}'
+        )
+    return choice
+
+
+def gravity(g: float | None, latitude: float | None, height: float | None) -> float | None:
+    """Return the stated local gravity in m/s^2, or None when nothing was stated.
+
+    Raises:
+        UsageError: out of range, stated twice, or a height without a latitude.
+    """
+    from accelcal_cli.sensor.gravity import check_gravity, normal_gravity
+
+    if g is not None and latitude is not None:
+        raise UsageError("--g and --latitude: expected one of them, not both")
+    if height is not None and latitude is None:
+        raise UsageError("--height: needs --latitude")
+    if g is not None:
+        return check_gravity(g)
+    return None if latitude is None else normal_gravity(latitude, height or 0.0)

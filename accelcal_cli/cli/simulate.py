@@ -1,0 +1,96 @@
+"""`accelcal simulate`: readings of a sensor whose errors are known."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from accelcal_cli.cli import options
+from accelcal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from accelcal_cli.sensor.simulation import Sensor, Simulated
+    from accelcal_cli.streams import Float
+
+MOST_SAMPLES = 100_000_000
+
+
+def command(
+    positions: Annotated[int, typer.Option(help="Number of poses.", min=1, max=MOST_SAMPLES)] = 12,
+    scheme: Annotated[
+        str | None,
+        typer.Option(help="faces, edges, faces-edges, icosahedron, turns, fibonacci or random."),
+    ] = None,
+    sensor: Annotated[str, typer.Option(help="dpso, mems, navigation, or a YAML file.")] = "dpso",
+    noise: Annotated[
+        float | None,
+        typer.Option(help="Noise of one sample and axis, one sigma, m/s^2.", show_default="the sensor's"),
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Samples of each pose.", min=1)] = 1,
+    attitude: Annotated[bool, typer.Option(help="Add the true specific force of each row.")] = False,
+    g: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    seed: options.Seed = 0,
+    output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
+    truth: Annotated[str | None, typer.Option(help="YAML file for the true parameters.")] = None,
+) -> None:
+    """Simulate static readings of an accelerometer with known errors.
+
+    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them.
+    """
+    import math
+
+    from accelcal_cli.config import dump, load_sensor
+    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.sensor.poses import directions
+    from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, simulate
+    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+    from accelcal_cli.streams import Streams
+
+    if noise is not None and not (math.isfinite(noise) and noise >= 0):
+        raise UsageError(f"--noise {noise:g}: expected zero or more, in m/s^2")
+    if positions * samples > MOST_SAMPLES:
+        raise UsageError(f"--positions {positions} with --samples {samples}: at most {MOST_SAMPLES:,} rows")
+    for path in (output, truth):
+        if path is not None:
+            check_target(path)
+    local_g = options.gravity(g, latitude, height) or STANDARD_GRAVITY
+    device = load_sensor(sensor)
+    u = directions(positions, scheme, Streams(seed, [0], purpose=ATTITUDE_PURPOSE).normal(positions, 3)[0])
+    sigma = device.noise if noise is None else noise
+    readings = simulate(device, u, local_g, samples, sigma, seed)
+    if truth is not None:
+        with whole_file(truth) as file:
+            file.write(dump(_truth(device, local_g, sigma, u)))
+    with whole_file(output) as file:
+        _write(file, readings, labelled=samples > 1, attitude=attitude)
+    sys.stdout.flush()
+
+
+def _write(file, readings: Simulated, *, labelled: bool, attitude: bool) -> None:  # type: ignore[no-untyped-def]
+    """Write the rows with the shortest digits that read back to the same numbers."""
+    names = ["pose"] * labelled + ["Nx", "Ny", "Nz"] + ["fx", "fy", "fz"] * attitude
+    file.write(",".join(names) + "\n")
+    for pose, output, force in zip(readings.pose, readings.output, readings.force, strict=True):
+        cells = [str(pose)] * labelled + [repr(float(v)) for v in output]
+        if attitude:
+            cells += [repr(float(v)) for v in force]
+        file.write(",".join(cells) + "\n")
+
+
+def _truth(device: Sensor, g: float, noise: float, u: Float) -> dict[str, object]:
+    """Return the true parameters, as configured and in gauge `lower`."""
+    model = device.model
+    return {
+        "sensor": device.name,
+        "unit": device.unit,
+        "g": g,
+        "noise": noise,
+        "K_a": model.K.tolist(),
+        "D_a": model.D.tolist(),
+        "K_a_lower": model.in_gauge("lower").K.tolist(),
+        "directions": u.tolist(),
+    }
