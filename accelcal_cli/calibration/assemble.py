@@ -185,7 +185,7 @@ def _curve(solution: Solution) -> tuple[tuple[int, float], ...]:
     if search.trace is None or search.trace_evaluations is None:
         return ()
     last = int(search.iterations[solution.best]) + 1
-    keep = np.unique(np.linspace(0, last - 1, min(last, CURVE_POINTS)).round().astype(int))
+    keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, CURVE_POINTS))})
     counts, costs = search.trace_evaluations[solution.best][keep], search.trace[solution.best][keep]
     return tuple((int(n), float(cost)) for n, cost in zip(counts, costs, strict=True) if np.isfinite(cost))
 
