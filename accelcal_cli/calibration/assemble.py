@@ -11,7 +11,7 @@ from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.nominal import Start
 from accelcal_cli.calibration.planner import fixture_directions, next_poses
 from accelcal_cli.calibration.quality import Observability
-from accelcal_cli.calibration.residuals import Fit, examine, outliers, rms_error
+from accelcal_cli.calibration.residuals import Fit, examine, outliers
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.robust import robust_variance
 from accelcal_cli.calibration.search import Solution, lower_problem, model_at
@@ -44,12 +44,12 @@ def assemble(
     information = quality.information(nine, point)[0]
     seen = Observability.of(information, readings.poses)
     freedom = readings.poses - 9
-    fit = examine(readings, low, g, seen.cofactor, weights, freedom)
+    before, before_model = _before(start, settings)
+    fit = examine(readings, low, before_model, g, seen.cofactor, weights)
     variance = _variance(readings, settings, solution, low, weights, freedom)
     covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
     sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
     suggestions = _suggest(information, seen)
-    before, before_model = _before(start, settings)
     ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
     return Calibration(
         K_a=shown.K,
@@ -65,7 +65,7 @@ def assemble(
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
         rms=fit.rms,
-        rms_before=rms_error(readings, before_model, g),
+        rms_before=fit.rms_before,
         before=before,
         s=float(np.sqrt(variance)),
         freedom=freedom,
