@@ -66,8 +66,8 @@ def assemble(
         gauge=settings.gauge,
         sigma=Sigma(sigma_K, sigma_D),
         dop=_dop(seen),
-        verdict="undetermined" if edge else seen.verdict,
-        reasons=_reasons(seen_first, suggestions, edge),
+        verdict=_verdict(seen, edge, freedom),
+        reasons=_reasons(seen_first, suggestions, edge, freedom),
         suggestions=suggestions,
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
@@ -227,8 +227,21 @@ def _at_edge(solution: Solution) -> tuple[str, ...]:
     return tuple(n for n, at in zip((*names, "D_1", "D_2", "D_3"), edge, strict=True) if at)
 
 
-def _reasons(seen: Observability, suggestions: tuple[str, ...], edge: tuple[str, ...]) -> tuple[str, ...]:
+def _verdict(seen: Observability, edge: tuple[str, ...], freedom: int) -> str:
+    """Return the verdict of the poses, lowered where the search or the count of poses does not bear it out."""
+    if edge:
+        return "undetermined"
+    return "weak" if freedom == 0 and seen.verdict == "good" else seen.verdict
+
+
+def _reasons(
+    seen: Observability, suggestions: tuple[str, ...], edge: tuple[str, ...], freedom: int
+) -> tuple[str, ...]:
     lines = list(quality.in_words(seen, suggestions))
+    if freedom < 0:
+        lines.insert(0, f"{9 + freedom} poses are fewer than the nine parameters; take at least 12.")
+    if freedom == 0:
+        lines.append("Nine poses fit exactly and say nothing of their noise: no sigma. Take at least 12.")
     if edge:
         lines.append(
             f"The least cost lies outside the search box, beyond {', '.join(edge)}: "

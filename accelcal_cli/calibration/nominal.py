@@ -22,9 +22,9 @@ SHIFT = 0.5
 itself, and the answer stays well inside."""
 
 
-SPHERE_PRIOR = 1e-5
-"""Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what noise
-of 0.3 % of g pretends to say about an axis that the poses do not turn through."""
+SPHERE_PRIOR = 1e-3
+"""Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what axes
+whose scale factors differ by 3 % pretend to say about an axis that the poses do not turn through."""
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,14 @@ def parameters(result: Calibration) -> Table:
     return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
 
 
+def _lost(result: Calibration) -> NDArray[np.bool_]:
+    """Return which of the nine parameters are undetermined, shape (9,): all of them with fewer than nine poses."""
+    return (np.array(list(result.dop.parameters.values())) > UNDETERMINED) | (result.freedom < 0)
+
+
 def _undetermined(result: Calibration) -> NDArray[np.bool_]:
     """Return which entries of K_a (rows 0 to 2) and D_a (row 3) the poses leave undetermined, shape (4, 3)."""
-    dop = np.array(list(result.dop.parameters.values())) > UNDETERMINED
+    dop = _lost(result)
     lost = np.zeros((4, 3), dtype=bool)
     for p, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))):
         lost[i, j] = lost[j, i] = dop[p]
@@ -69,7 +74,7 @@ def engineering(result: Calibration) -> Table:
     scale = units.scale_error(result.K_a, result.nominal_scale)
     angle = units.misalignment(result.K_a)
     bias = units.bias_force(result.K_a, result.D_a - result.nominal_bias)
-    lost = np.array(list(result.dop.parameters.values())) > UNDETERMINED
+    lost = _lost(result)
     sigma = np.where(lost, np.nan, sigma)
     rows = [_row(f"scale factor error {AXES[i]}", scale[i], sigma[i] / per_g, "ppm", "%") for i in range(3)]
     for p, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
