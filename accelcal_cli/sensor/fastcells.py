@@ -30,14 +30,11 @@ class FastParser:
             plain = form(block)
             frame = None if plain is None else self._frame(plain)
             numbers = None if frame is None else self._numbers(frame)
-            if frame is not None and numbers is not None:
-                return self._rows(frame, numbers)
+            text = None if frame is None else self._text(frame)
+            if numbers is not None and text is not None:
+                asked = self.careful.selection.text is not None
+                return Rows(self.careful.skip(len(numbers)), numbers, text if asked else None)
         return self.careful.parse(block)
-
-    def _rows(self, frame: pl.DataFrame, numbers: NDArray[np.float64]) -> Rows:
-        column = self.careful.selection.text
-        text = None if column is None else frame[str(column)].to_list()
-        return Rows(self.careful.skip(len(numbers)), numbers, text)
 
     def _bare(self, block: bytes) -> bytes | None:
         """The block as it is, where every column is read as a number, so that nothing odd can hide."""
@@ -51,6 +48,8 @@ class FastParser:
         """The block with one-byte separators only, or None if it needs care."""
         dialect = self.careful.dialect
         if b'"' in block or b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+            return None
+        if self.careful.selection.text in self.careful.selection.numbers:
             return None
         if dialect.decimal_comma and (b"." in block or dialect.separator == ","):
             return None
@@ -93,6 +92,14 @@ class FastParser:
             numbers[:, k] = series.to_numpy()
         sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
         return numbers if sound else None
+
+    def _text(self, frame: pl.DataFrame) -> list[str] | None:
+        """Stripped text of the text column, [] where none is asked for, None where a cell is empty."""
+        column = self.careful.selection.text
+        if column is None:
+            return []
+        text = [(cell or "").strip() for cell in frame[str(column)].to_list()]
+        return text if all(text) else None
 
 
 def _has_outer_blank_line(block: bytes) -> bool:

@@ -44,7 +44,7 @@ class ByteSource:
         raw = self._read(head)
         self.whole = len(raw) < head  # the head is all there is
         self._hash.update(raw)
-        self._carriage_returns = b"\n" not in raw and b"\r" in raw  # line ends of old Macs
+        self._carriage_returns = b"\n" not in raw and b"\r" in raw[:-1]  # line ends of old Macs
         self.head = self._unify(raw)
         for magic, what in _FOREIGN.items():
             if raw.startswith(magic):
