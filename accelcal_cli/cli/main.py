@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import calibrate, simulate
+from accelcal_cli.cli import benchmark, calibrate, optimizers, simulate
 from accelcal_cli.errors import AccelcalError
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -29,6 +29,8 @@ app = typer.Typer(
 )
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
+app.command("benchmark")(benchmark.command)
+app.command("optimizers")(optimizers.command)
 
 
 def _version(wanted: bool) -> None:
