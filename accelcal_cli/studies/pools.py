@@ -95,7 +95,7 @@ def cluster(address: str) -> Iterator[Executor]:
         try:
             yield client.get_executor(pure=False)
         except (KilledWorker, CancelledError, OSError) as error:
-            raise DataError(f"{where}: lost: {str(error).splitlines()[0]}; finished runs are kept") from None
+            raise DataError(f"{where}: lost ({type(error).__name__} {error})") from None
 
 
 def _check_workers(client: Any, where: str) -> None:
