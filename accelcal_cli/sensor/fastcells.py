@@ -57,7 +57,7 @@ class FastParser:
             return None
         if b"\r" in block:
             block = block.replace(b"\r\n", b"\n")
-        block = _squeeze(block, dialect.separator.encode())
+        block = _squeeze(block, dialect.separator)
         return None if b"\r" in block or _has_outer_blank_line(block) else block
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
@@ -115,18 +115,23 @@ def _is_utf8(block: bytes) -> bool:
     return True
 
 
-def _squeeze(block: bytes, separator: bytes) -> bytes:
-    """Drop the blanks around cells; for a white-space table leave one blank between them."""
-    blanks = (b" ",) if separator == b"\t" else (b" ", b"\t")
-    if not any(blank in block for blank in blanks):
-        return block
-    if separator == b" ":
+def _squeeze(block: bytes, separator: str) -> bytes:
+    """Drop the blanks around cells; of a run of blanks that is itself the separator leave one."""
+    if separator == " ":
         block = block.replace(b"\t", b" ")
-        for run in (b"        ", b"   ", b"  ", b"  "):
-            block = block.replace(run, b" ")
-    for blank in blanks:
-        for edge in (b"\n", separator):
-            for pair in (edge + blank, blank + edge) if edge != blank else ():
-                while pair in block:
-                    block = block.replace(pair, edge)
-    return block.removeprefix(b" ")
+    elif b" " not in block and (separator == "\t" or b"\t" not in block):
+        return block
+    text = np.frombuffer(block, np.uint8)
+    while True:
+        blank = text == ord(" ")
+        edge = text == ord("\n")
+        if separator != " ":
+            edge |= text == ord(separator)
+        if separator not in " \t":
+            blank |= text == ord("\t")
+        drop = blank.copy()
+        drop[1:] &= edge[:-1] | blank[:-1] if separator == " " else edge[:-1]
+        drop[:-1] |= blank[:-1] & edge[1:]
+        if not drop.any():
+            return text.tobytes()
+        text = text[~drop]
