@@ -42,7 +42,10 @@ def split_cells(line: str, separator: str) -> list[str]:
         return line.split() if separator == " " else [cell.strip() for cell in line.split(separator)]
     if separator == " ":
         line = " ".join(line.split())
-    row = next(csv.reader([line.strip()], delimiter=separator, skipinitialspace=True))
+    try:
+        row = next(csv.reader([line.strip(" \r\n")], delimiter=separator, skipinitialspace=True))
+    except csv.Error:  # a carriage return or an endless cell: then the quotes are no quotes either
+        row = line.split(separator)
     return [cell.strip() for cell in row]
 
 

@@ -47,7 +47,7 @@ class FastParser:
     def _plain(self, block: bytes) -> bytes | None:
         """The block with one-byte separators only, or None if it needs care."""
         dialect = self.careful.dialect
-        if b'"' in block or b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+        if b"#" in block or b"\0" in block or not block.endswith(b"\n"):
             return None
         if self.careful.selection.text in self.careful.selection.numbers:
             return None
@@ -57,13 +57,16 @@ class FastParser:
             return None
         if b"\r" in block:
             block = block.replace(b"\r\n", b"\n")
-        block = _squeeze(block, dialect.separator)
-        return None if b"\r" in block or _has_outer_blank_line(block) else block
+        squeezed = _squeeze(block, dialect.separator)
+        if b'"' in block and (dialect.separator == " " or squeezed != block):
+            return None  # blanks within quotes belong to the cell
+        return None if b"\r" in squeezed or _has_outer_blank_line(squeezed) else squeezed
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
 
         dialect, selection = self.careful.dialect, self.careful.selection
+        quoted = b'"' in block
         schema = {str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)}
         try:
             frame = pl.read_csv(
@@ -71,15 +74,16 @@ class FastParser:
                 has_header=False,
                 schema=schema,
                 separator=dialect.separator,
-                quote_char=None,
+                quote_char='"' if quoted else None,
                 decimal_comma=dialect.decimal_comma,
             )
         except pl.exceptions.PolarsError:
             return None
-        if dialect.width - 1 not in selection.numbers:  # a short row then shows only in the count
-            separators = np.count_nonzero(np.frombuffer(block, np.uint8) == ord(dialect.separator))
-            if separators != (dialect.width - 1) * len(frame):
-                return None
+        if quoted and _count(block, "\n") != len(frame):
+            return None  # a cell goes on over the end of its line
+        if frame[str(dialect.width - 1)].null_count():  # an empty last cell, or a row that is short
+            short = quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
+            return None if short else frame
         return frame
 
     def _numbers(self, frame: pl.DataFrame) -> NDArray[np.float64] | None:
@@ -105,6 +109,10 @@ class FastParser:
 def _has_outer_blank_line(block: bytes) -> bool:
     """Whether a block begins or ends with a blank line; polars passes over these without a null."""
     return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
+
+
+def _count(block: bytes, character: str) -> int:
+    return int(np.count_nonzero(np.frombuffer(block, np.uint8) == ord(character)))
 
 
 def _is_utf8(block: bytes) -> bool:
