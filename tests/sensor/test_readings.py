@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,12 @@ def test_blocks_can_be_read_again_and_again() -> None:
     for _ in range(2):
         blocks = [(start, block.tolist()) for start, block in readings.blocks(2)]
         assert blocks == [(0, [[1, 2, 3], [4, 5, 6]]), (2, [[7, 8, 9.5]])]
+
+
+def test_readings_travel_to_another_process() -> None:
+    readings = pickle.loads(pickle.dumps(read(GOOD)))
+    assert readings.output().tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9.5]]
+    assert readings.where(1) == "line 3"
 
 
 def test_lines_are_counted_as_in_the_file() -> None:
@@ -128,6 +135,13 @@ def test_missing_file_names_its_neighbour(tmp_path: Path) -> None:
         read_readings(tmp_path / "pose.csv")
     with pytest.raises(DataError, match=r"no such file; the folder .* does not exist either"):
         read_readings(tmp_path / "nowhere" / "poses.csv")
+
+
+def test_foreign_file(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_bytes(b"PK\x03\x04")
+    with pytest.raises(DataError, match=r"poses\.csv: is a zip archive"):
+        read_readings(path)
 
 
 def test_folder_and_locked_file(tmp_path: Path) -> None:
@@ -243,7 +257,7 @@ def test_from_array() -> None:
         ({"output": [[1, 2, 3]] * 2}, "are equal"),
         ({"labels": ["a"]}, "2 different labels"),
         ({"labels": ["a", "a"]}, "2 different labels"),
-        ({"count": [1, 0]}, "counts of 1 or more"),
+        ({"count": [1, 0]}, "count: whole numbers of 1 or more"),
         ({"count": [1]}, r"count: an array of shape \(2,\) was expected, not \(1,\)"),
         ({"scatter": [1, 2]}, r"scatter: an array of shape \(2, 3\)"),
         ({"reference": [[1, 2, 3], [1, 2, np.nan]]}, "reference: row 1"),
