@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +70,13 @@ def modulus_errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[
 
 
 def examine(
-    readings: Readings, model: ErrorModel, g: float, cofactor: Float, weights: Float | None, freedom: int
+    readings: Readings,
+    model: ErrorModel,
+    g: float,
+    cofactor: Float,
+    weights: Float | None,
+    freedom: int,
+    robust: Callable[[Float], Float] | None = None,
 ) -> Fit:
     """Return the fit of a model in gauge `lower`, pose by pose.
 
@@ -81,11 +87,14 @@ def examine(
         cofactor: (J^T W J)^-1, shape (9, 9).
         weights: shape (J,) or None.
         freedom: J - 9; studentised residuals need at least 2.
+        robust: the weight that a robust fit gave a weighted residual, m/s^2; None after least squares.
     """
     square_sum, weighted_sum = 0.0, 0.0
     parts: list[tuple[Int, Float, Float, Float]] = []
     for first, e, u in modulus_errors(readings, model, g):
         w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
+        if robust is not None:
+            w = w * robust(np.sqrt(w) * e)
         rows = design(u)
         leverage = np.minimum(w * np.einsum("jp,pq,jq->j", rows, cofactor, rows), 1.0)
         error = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
