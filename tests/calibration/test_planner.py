@@ -74,10 +74,11 @@ def test_predicted_dilution_is_that_of_the_enlarged_set(seed):
 def test_choosing_stops_when_it_is_enough(name):
     u, candidates = SETS[name], fixture_directions()
     information = _information(u)
-    chosen = next_poses(information, candidates, 40, enough=1.2)
-    assert 0 < len(chosen) < 40
-    assert dop_after(information, candidates[chosen]).worst <= 1.2 * (1 + 1e-6)
-    assert dop_after(information, candidates[chosen[:-1]]).worst > 1.2
+    enough = 0.8 * min(2.0, Observability.of(information, 9).worst)
+    chosen = next_poses(information, candidates, 60, enough=enough)
+    assert 0 < len(chosen) < 60
+    assert dop_after(information, candidates[chosen]).worst <= enough * (1 + 1e-6)
+    assert dop_after(information, candidates[chosen[:-1]]).worst > enough
 
 
 def test_a_set_that_is_good_enough_needs_nothing():
