@@ -39,14 +39,19 @@ def check(instance: Any, where: str = "") -> None:
         if isinstance(value, bool) or not isinstance(value, int | float):
             continue
         label = f"{where}{field.name}"
-        if not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{label}: {value} is not a finite number")
         if limits.get("low") is not None and value < limits["low"]:
             raise ConfigError(f"{label}: {value} is too small; expected at least {limits['low']:g}")
         if limits.get("above") is not None and value <= limits["above"]:
             raise ConfigError(f"{label}: {value} is too small; expected more than {limits['above']:g}")
         if limits.get("high") is not None and value > limits["high"]:
-            raise ConfigError(f"{label}: {value} is too large; expected at most {limits['high']:g}")
+            raise ConfigError(f"{label}: {_shown(value)} is too large; expected at most {limits['high']:g}")
+
+
+def _shown(value: float) -> str:
+    text = str(value)
+    return text if len(text) <= 30 else f"{text[:30]}..."
 
 
 def _all_finite(values: tuple[Any, ...]) -> bool:

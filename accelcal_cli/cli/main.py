@@ -97,7 +97,8 @@ def _open_streams() -> None:
     """Put the null device where a stream was closed, as by `<&-`: Python has None there."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115  # open as long as the program
+            null = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, open(null, mode, closefd=False))  # noqa: SIM115  # open as long as the program
 
 
 def _fail(message: str, code: int) -> NoReturn:

@@ -118,7 +118,11 @@ def open_source(source: str | Path, stdin: BinaryIO | None = None) -> ByteSource
         raise DataError(f"{source}: no permission to read it") from problem
     except (OSError, ValueError) as problem:  # ValueError: a NUL in the name
         raise DataError(f"{source}: cannot be opened ({problem})") from problem
-    return ByteSource(stream, str(source))
+    try:
+        return ByteSource(stream, str(source))
+    except BaseException:
+        stream.close()
+        raise
 
 
 def _neighbour(path: Path) -> str:
