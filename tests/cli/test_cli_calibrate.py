@@ -200,6 +200,8 @@ def test_repeated_readings_are_averaged_and_judged(run):
     result = record(run, "data.csv", "--weights", "sd")
     assert result["poses"] == 12
     assert 0.2 < result["noise_ratio"] < 3
+    assert run("calibrate", "data.csv", "--weights", "sd", "-o", "result.yaml").code == 0
+    assert load_mapping(Path("result.yaml")) == result
 
 
 def test_columns_by_name_or_number(run, tmp_path):
