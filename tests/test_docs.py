@@ -91,6 +91,7 @@ class Reader:
         if command == "echo $?":
             return [str(self.code)]
         self.code, text = self._call(["bash", "-c", command])
+        assert "Traceback" not in text, text
         return [line.rstrip() for line in text.splitlines()]
 
     def python(self, code: str) -> None:
