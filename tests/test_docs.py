@@ -114,18 +114,25 @@ class Reader:
 
 
 def same(shown: str, printed: str) -> bool:
-    """Whether two lines agree; numbers to 1e-4, and costs at the floor of rounding to a factor of 1000."""
+    """Whether two lines agree, but for what the rounding of another processor may change.
+
+    Numbers agree to 1e-4. A search that has not converged, the floor of rounding and the steps of a solver
+    depend on the last digits: small costs agree within a factor, evaluations to a tenth.
+    """
     if shown == printed:
         return True
     if NUMBER.sub("#", shown).split() != NUMBER.sub("#", printed).split():
         return False
     pairs = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True)
-    return all(_near(*(float(text.replace(",", "")) for text in pair)) for pair in pairs)
+    return all(_near(*(float(text.replace(",", "")) for text in pair), shown) for pair in pairs)
 
 
-def _near(a: float, b: float) -> bool:
-    tiny = 0 < min(a, b) and max(a, b) < 1e-20
-    return abs(math.log10(a / b)) < 3 if tiny else math.isclose(a, b, rel_tol=1e-4)
+def _near(a: float, b: float, line: str) -> bool:
+    if min(a, b) > 0 and max(a, b) < 1e-20:
+        return abs(math.log10(a / b)) < 3
+    if "cost L" in line and min(a, b) > 0 and max(a, b) < 0.01:
+        return abs(math.log10(a / b)) < 1.5
+    return math.isclose(a, b, rel_tol=0.1 if "evaluations" in line else 1e-4)
 
 
 def find(expected: list[str], printed: list[str]) -> str | None:
@@ -163,7 +170,7 @@ def test_the_commands_of_a_page_do_what_it_says(name, tmp_path):
 def _follow(reader: Reader, told: list[Step]) -> None:
     for step, then in zip(told, [*told[1:], None], strict=True):
         printed = reader.run(step.command)
-        if then is None or then.command != "echo $?":
+        if step.command != "echo $?" and (then is None or then.command != "echo $?"):
             assert reader.code == 0, "\n".join([step.command, *printed])
         wrong = find(step.expected, printed) if step.expected else None
         assert wrong is None, "\n".join([f"$ {step.command}", f"not as told: {wrong}", *printed, HOW])
@@ -297,7 +304,9 @@ def test_the_schemes_have_the_dilution_that_is_told(tmp_path):
     reader = Reader(tmp_path)
     assert len(rows) == 5
     for scheme, count, *told in rows:
-        line = f"accelcal simulate --scheme {scheme} --positions {count} | accelcal calibrate - -q --format json"
+        line = (
+            f"accelcal simulate --scheme {scheme} --positions {count} | accelcal calibrate - -q --format json"
+        )
         dop = json.loads("\n".join(reader.run(line)))["dop"]
         assert [f"{dop[kind]:.2f}" for kind in ("misalignment", "scale", "bias")] == told, scheme
 

@@ -21,7 +21,12 @@ def run(*command: str | Path, folder: Path, path: Path | None = None) -> str:
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("PIP_", "PYTHONPATH"))}
     environment = kept if path is None else {**kept, "PYTHONPATH": str(path)}
     done = subprocess.run(
-        list(map(str, command)), cwd=folder, env=environment, capture_output=True, encoding="utf-8", check=False
+        list(map(str, command)),
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
