@@ -50,9 +50,9 @@ def test_a_reader_that_leaves_is_no_error(shell, line):
     ("stream", "parts"),
     [
         ("head -c 2G /dev/zero", ["<stdin>, line 1", "NUL"]),
-        ("yes 0,0,0", ["<stdin>", "readings are all equal: (0, 0, 0)"]),
+        ("yes 0,0,0", ["<stdin>", "readings are all equal"]),
         ("tr '\\0' 1 </dev/zero", ["<stdin>, line 1", "longer than 1 MB"]),
-        ("head -c 3M /dev/urandom", ["<stdin>, line 1"]),
+        ("head -c 3M /dev/urandom", ["<stdin>, line "]),
     ],
 )
 def test_a_stream_of_nonsense_is_cut_off(shell, stream, parts):
