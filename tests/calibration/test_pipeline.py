@@ -191,9 +191,10 @@ def test_a_stated_nominal_sensor_and_box():
 def test_a_solution_at_the_edge_of_its_box_is_reported():
     nominal = Nominal(scale=(5.9e5, 5.67e5, 5.67e5))
     result = calibrate(readings(poses.turns()), _fast(nominal=nominal, box=BoxSettings(scale=0.02)))
-    (note,) = [note for note in result.notes if "edge of the search box" in note]
-    assert "K11" in note
-    assert "K22" not in note
+    (reason,) = [reason for reason in result.reasons if "outside the search box" in reason]
+    assert "K_11" in reason
+    assert "K_22" not in reason
+    assert result.verdict == "undetermined"
     assert result.K_a[0, 0] == pytest.approx(5.9e5 * 0.98, rel=1e-9)
 
 
