@@ -6,7 +6,6 @@ Shapes everywhere: R runs, P points of a population, D dimensions, M residuals.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +36,26 @@ class Problem(ABC):
         """D, the number of unknowns."""
         return int(self.lower.size)
 
+    @property
+    def units(self) -> Float:
+        """How much of its own unit one step of each coordinate is, shape (D,) or (R, D)."""
+        return np.ones(self.dimensions)
+
+    @property
+    def groups(self) -> Int:
+        """Number of the group of alike unknowns that each coordinate belongs to, shape (D,)."""
+        return np.zeros(self.dimensions, dtype=np.intp)
+
     @abstractmethod
     def cost(self, x: Float) -> Float:
         """Return the cost, shape (R, P), at x, shape (R, P, D)."""
+
+    def gradient_hessian(self, x: Float) -> tuple[Float, Float]:
+        """Return the gradient, shape (R, P, D), and Hessian, (R, P, D, D), of the cost at x, shape (R, P, D).
+
+        By central differences of the cost, 2 D^2 evaluations a point, unless the problem knows better.
+        """
+        return differences(self, x)
 
     def residuals(self, x: Float) -> Float:
         """Return residuals whose squares sum to the cost, shape (R, P, M), at x, shape (R, P, D)."""
@@ -96,6 +112,23 @@ class Counted(Problem):
         self.evaluations += x.shape[1]
         return self.problem.jacobian(x)
 
+    @property
+    def units(self) -> Float:
+        """The problem's own units; see `Problem.units`."""
+        return self.problem.units
+
+    @property
+    def groups(self) -> Int:
+        """The problem's own groups; see `Problem.groups`."""
+        return self.problem.groups
+
+    def gradient_hessian(self, x: Float) -> tuple[Float, Float]:
+        """Return gradient and Hessian; analytic ones count as one evaluation a point, differences as they are."""
+        if type(self.problem).gradient_hessian is Problem.gradient_hessian:
+            return differences(self, x)
+        self.evaluations += x.shape[1]
+        return self.problem.gradient_hessian(x)
+
     def closed_form(self) -> Float:
         """Return the closed form, which evaluates nothing."""
         return self.problem.closed_form()
@@ -116,6 +149,27 @@ class Counted(Problem):
             self.best_cost = np.where(better, least, self.best_cost)
             self.best_x = np.where(better[:, None], x[self._rows, column], self.best_x)
 
-    def __getattr__(self, name: str) -> Any:
-        """Look up anything else (units of a coordinate, ...) on the wrapped problem."""
-        return getattr(self.problem, name)
+
+def differences(problem: Problem, x: Float) -> tuple[Float, Float]:
+    """Return gradient and Hessian of a cost by central differences; see `Problem.gradient_hessian`.
+
+    The step is the fourth root of the rounding unit times the box, which balances truncation and rounding of a
+    second difference.
+    """
+    D = problem.dimensions
+    h = np.finfo(float).eps ** 0.25 * 0.5 * (problem.upper - problem.lower)
+    f0 = problem.cost(x)
+    steps = np.diag(h)
+    plus = np.stack([problem.cost(x + steps[i]) for i in range(D)], axis=-1)
+    minus = np.stack([problem.cost(x - steps[i]) for i in range(D)], axis=-1)
+    gradient = (plus - minus) / (2.0 * h)
+    hessian = np.empty((*x.shape, D))
+    for i in range(D):
+        hessian[..., i, i] = (plus[..., i] - 2.0 * f0 + minus[..., i]) / h[i] ** 2
+        for j in range(i):
+            both = problem.cost(x + steps[i] + steps[j]) + problem.cost(x - steps[i] - steps[j])
+            mixed = (both - plus[..., i] - plus[..., j] - minus[..., i] - minus[..., j] + 2.0 * f0) / (
+                2 * h[i] * h[j]
+            )
+            hessian[..., i, j] = hessian[..., j, i] = mixed
+    return gradient, hessian

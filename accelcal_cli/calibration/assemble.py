@@ -12,7 +12,7 @@ from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.nominal import Start
 from accelcal_cli.calibration.planner import fixture_directions, next_poses
 from accelcal_cli.calibration.quality import Observability
-from accelcal_cli.calibration.residuals import Fit, examine, outliers, rms_error
+from accelcal_cli.calibration.residuals import Fit, examine, outliers
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.robust import loss_weight, robust_variance
 from accelcal_cli.calibration.search import NO_NOISE, Solution, lower_problem, model_at
@@ -26,6 +26,10 @@ COMFORTABLE = 5.0
 """Suggested poses bring every dilution of precision to this: half of what counts as weak."""
 
 MOST_SUGGESTIONS = 8
+NOISE_BIAS = 3.0
+"""Isotropic noise of standard deviation s makes scale factors too large by about 3 (s/g)^2: |f|^2 grows by 3 s^2
+on average, and the noise in the products of outputs doubles it. Measured at s/g from 0.02 to 0.1."""
+
 EDGE = 1e-6
 """A parameter within this part of a half-width from the wall of its box is at the edge."""
 
@@ -45,12 +49,15 @@ def assemble(
     information = quality.information(nine, point)[0]
     seen = Observability.of(information, readings.poses)
     freedom = readings.poses - 9
-    fit = examine(readings, low, g, seen.cofactor, weights, freedom, _robust_weight(solution, settings))
+    edge = _at_edge(solution)
+    before, before_model = _before(start, settings)
+    fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
     variance = _variance(readings, settings, solution, low, weights, freedom)
     covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
     sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
-    suggestions = _suggest(information, seen)
-    before, before_model = _before(start, settings)
+    said, seen_first = _first_sight(solution, start, information, seen, readings.poses)
+    suggestions = _suggest(said, seen_first)
+    scale_sigma = float(np.sqrt(np.diagonal(covariance)[quality.SCALE]).max()) / g
     ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
     return Calibration(
         K_a=shown.K,
@@ -60,13 +67,13 @@ def assemble(
         gauge=settings.gauge,
         sigma=Sigma(sigma_K, sigma_D),
         dop=_dop(seen),
-        verdict=seen.verdict,
-        reasons=quality.in_words(seen, suggestions),
+        verdict=_verdict(seen, edge, freedom),
+        reasons=_reasons(seen_first, suggestions, edge, freedom),
         suggestions=suggestions,
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
         rms=fit.rms,
-        rms_before=rms_error(readings, before_model, g),
+        rms_before=fit.rms_before,
         before=before,
         s=float(np.sqrt(variance)),
         freedom=freedom,
@@ -86,7 +93,7 @@ def assemble(
         settings=_settings_record(settings, start),
         g=g,
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
-        notes=(*readings.notes, *_notes(solution, start, settings)),
+        notes=(*readings.notes, *_notes(solution, start, settings, np.sqrt(variance), scale_sigma)),
         version=__version__,
     )
 
@@ -113,6 +120,22 @@ def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], 
     if noise is None or noise <= NO_NOISE * settings.g:
         return None
     return lambda e: loss_weight(e / noise, settings.robust)
+
+
+def _first_sight(
+    solution: Solution, start: Start, information: Float, seen: Observability, poses: int
+) -> tuple[Float, Observability]:
+    """Return the information and observability that the verdict is explained with.
+
+    Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
+    nearest sphere then sees the attitudes better than the fit does.
+    """
+    if start.source != "sphere":
+        return information, seen
+    nine, point = lower_problem(solution.problem, model_at(solution.problem, np.zeros_like(solution.x)))
+    said = quality.information(nine, point)[0]
+    first = Observability.of(said, poses)
+    return (said, first) if first.verdict == "undetermined" else (information, seen)
 
 
 def _suggest(information: Float, seen: Observability) -> tuple[str, ...]:
@@ -194,24 +217,64 @@ def _curve(solution: Solution) -> tuple[tuple[int, float], ...]:
     if search.trace is None or search.trace_evaluations is None:
         return ()
     last = int(search.iterations[solution.best]) + 1
-    keep = np.unique(np.linspace(0, last - 1, min(last, CURVE_POINTS)).round().astype(int))
+    keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, CURVE_POINTS))})
     counts, costs = search.trace_evaluations[solution.best][keep], search.trace[solution.best][keep]
     return tuple((int(n), float(cost)) for n, cost in zip(counts, costs, strict=True) if np.isfinite(cost))
 
 
-def _notes(solution: Solution, start: Start, settings: Settings) -> tuple[str, ...]:
-    notes = []
-    names = ("K11", "K22", "K33", "K21", "K31", "K32", "K12", "K13", "K23")[: solution.x.shape[1] - 3]
-    names = (*names, "Dx", "Dy", "Dz")
-    edge = [n for n, u in zip(names, solution.x[0], strict=True) if abs(u) >= 1.0 - EDGE]
+def _at_edge(solution: Solution) -> tuple[str, ...]:
+    """Return the parameters at a wall of the search box.
+
+    Where they are, the least cost lies outside the box. In gauge `full` the free rotation reaches the walls of
+    the off-diagonals by itself, which says nothing.
+    """
+    unknowns = solution.x.shape[1]
+    names = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: unknowns - 3]
+    edge = np.abs(solution.x[0]) >= 1.0 - EDGE
+    if unknowns == 12:
+        edge[3:9] = False
+    return tuple(n for n, at in zip((*names, "D_1", "D_2", "D_3"), edge, strict=True) if at)
+
+
+def _verdict(seen: Observability, edge: tuple[str, ...], freedom: int) -> str:
+    """Return the verdict of the poses, lowered where the search or the count of poses does not bear it out."""
     if edge:
-        notes.append(f"At the edge of the search box: {', '.join(edge)}. Widen the box (--config, key box).")
-    if start.source == "mid-range":
-        notes.append("The readings fix no ellipsoid; the search started from the middle of their range.")
+        return "undetermined"
+    return "weak" if freedom == 0 and seen.verdict == "good" else seen.verdict
+
+
+def _reasons(
+    seen: Observability, suggestions: tuple[str, ...], edge: tuple[str, ...], freedom: int
+) -> tuple[str, ...]:
+    lines = list(quality.in_words(seen, suggestions))
+    if freedom < 0:
+        lines.insert(0, f"{9 + freedom} poses are fewer than the nine parameters; take at least 12.")
+    if freedom == 0:
+        lines.append("Nine poses fit exactly and say nothing of their noise: no sigma. Take at least 12.")
+    if edge:
+        lines.append(
+            f"The least cost lies outside the search box, beyond {', '.join(edge)}: "
+            "widen the box or state the nominal sensor (--config, keys box and nominal)."
+        )
+    return tuple(lines)
+
+
+def _notes(
+    solution: Solution, start: Start, settings: Settings, s: float, sigma_scale: float
+) -> tuple[str, ...]:
+    notes = []
+    if start.source == "sphere":
+        notes.append("The readings fix no ellipsoid; the search started from the nearest sphere.")
     if not np.isfinite(solution.search.cost).any():
         notes.append(f"The {settings.optimizer} search failed; the result is the polished nominal sensor.")
     if settings.runs > 1 and solution.agreeing < settings.runs:
         notes.append(f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.")
+    bias = NOISE_BIAS * (s / settings.g) ** 2
+    if bias > sigma_scale:
+        notes.append(
+            f"The noise of one reading, {s:.3g}, is so large that it makes the scale factors about {bias:.1%} too "
+            "large, more than their sigma: average the readings of each pose first (a column that labels the pose)."
+        )
     return tuple(notes)
 
 

@@ -43,14 +43,19 @@ class Triangle:
 
 
 def rows(x: Float) -> Float:
-    """Return [phi(x), 1], shape (..., 11), for normalised readings x, shape (..., 3)."""
-    first, second = PAIRS
-    h = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-    out = np.empty((*x.shape[:-1], 11))
-    np.multiply(h[..., first], h[..., second], out=out[..., :10])
-    out[..., 3:9] *= 2.0
-    out[..., 10] = 1.0
-    return out
+    """Return [phi(x), 1], shape (..., J, 11), for normalised readings x, shape (..., J, 3).
+
+    Written column by column into memory of shape (..., 11, J): products of contiguous columns.
+    """
+    h = np.ascontiguousarray(x.swapaxes(-1, -2))
+    out = np.empty((*x.shape[:-2], 11, x.shape[-2]))
+    for k in range(3):
+        np.multiply(h[..., k, :], h[..., k, :], out=out[..., k, :])
+        np.multiply(h[..., k, :], 2.0, out=out[..., 6 + k, :])
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        np.multiply(out[..., 6 + i, :], h[..., j, :], out=out[..., 3 + k, :])
+    out[..., 9:, :] = 1.0
+    return out.swapaxes(-1, -2)
 
 
 def compress(blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale: float) -> Triangle:

@@ -102,11 +102,10 @@ class Loetters(Problem):
         """
         K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
         A = np.linalg.inv(K)
-        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)
-        inner = np.concatenate([A, -(A @ d[..., None])], axis=-1)  # dM for dK_ij is -A e_i (row j of this)
+        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)  # dM for dK_ij is -A e_i (row j of M)
         columns = []
         for i, j in ROWS_COLUMNS[: self.unknowns - 3]:
-            columns.append(_quadratic_change(M, -A[..., :, i, None] * inner[..., j, None, :]))
+            columns.append(_quadratic_change(M, -A[..., :, i, None] * M[..., j, None, :]))
         for i in range(3):
             change = np.zeros_like(M)
             change[..., 3] = -A[..., :, i]
@@ -114,6 +113,38 @@ class Loetters(Problem):
         q = np.stack(columns, axis=-1) * self._half[:, None, None]
         jacobian: Float = (self._R[:, None] @ q) * self.g**2
         return jacobian
+
+    @property
+    def groups(self) -> Int:
+        """Scale factors 0, misalignments 1, biases 2."""
+        return np.repeat([0, 1, 2], [3, self.unknowns - 6, 3])
+
+    def gradient_hessian(self, x: Float) -> tuple[Float, Float]:
+        """Return the gradient, shape (R, P, D), and full Hessian of L, (R, P, D, D), at x, shape (R, P, D).
+
+        grad L = 2 J^T r, H = 2 J^T J + 2 sum_k r_k d2 r_k. The residuals are linear in q = vech(M^T M), so the second
+        part is the Hessian of <Y, M^T M> with Y from R^T r. With dM = -A W, W = dK M + (0 | dd), it is
+        2 <A W Y, A W> + 4 <M Y, A dK A W> as a quadratic form.
+        """
+        J, r = self.jacobian(x) / self.g**2, self.residuals(x) / self.g**2
+        K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
+        A = np.linalg.inv(K)
+        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)
+        Y = _symmetric((self._R.swapaxes(1, 2)[:, None] @ r[..., None])[..., 0])
+        dK = np.zeros((self.unknowns, 3, 3))
+        dd = np.zeros((self.unknowns, 3, 4))
+        for p, (i, j) in enumerate(ROWS_COLUMNS[: self.unknowns - 3]):
+            dK[p, i, j] = 1.0
+        dd[-3:, :, 3] = np.eye(3)
+        AW = A[..., None, :, :] @ (dK @ M[..., None, :, :] + dd)  # (R, P, D, 3, 4)
+        AdK = A[..., None, :, :] @ dK
+        curvature = np.einsum("rpaik,rpkl,rpbil->rpab", AW, Y, AW)
+        mixed = np.einsum("rpik,rpaij,rpbjk->rpab", M @ Y, AdK, AW)
+        second = 2.0 * curvature + 2.0 * (mixed + mixed.swapaxes(2, 3))
+        half = self._half[:, None, :]
+        hessian = 2.0 * J.swapaxes(2, 3) @ J + 2.0 * second * half[..., :, None] * half[..., None, :]
+        gradient = 2.0 * (J.swapaxes(2, 3) @ r[..., None])[..., 0]
+        return gradient * self.g**4, hessian * self.g**4
 
     def closed_form(self) -> Float:
         """Return the ellipsoid fit in box coordinates, shape (R, D); NaN where the readings fix no ellipsoid."""
@@ -150,6 +181,18 @@ def _quadratic_change(M: Float, dM: Float) -> Float:
     change = dM.swapaxes(-1, -2) @ M
     first, second = PAIRS
     return change[..., first, second] + change[..., second, first]
+
+
+def _symmetric(y: Float) -> Float:
+    """Return the symmetric Y, shape (..., 4, 4), with <Y, Q> = y . q for q = vech(Q), shape (..., 10).
+
+    The rows phi carry the factor 2 of the off-diagonals, so Y holds y halved there.
+    """
+    Y = np.zeros((*y.shape[:-1], 4, 4))
+    first, second = PAIRS
+    Y[..., first, second] += 0.5 * y
+    Y[..., second, first] += 0.5 * y
+    return Y
 
 
 def _rows_lower(theta: Float) -> Float:

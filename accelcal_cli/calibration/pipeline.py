@@ -34,7 +34,7 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
     centre = 0.5 * (readings.lower + readings.upper)
     scale = 0.5 * float((readings.upper - readings.lower).max())
     triangle = compress(_weighted(readings, weights), centre, scale)
-    start = search_box(triangle, readings.lower, readings.upper, settings)
+    start = search_box(triangle, settings)
     problem = Loetters(triangle, settings.g, start.box)
     solution = search(problem, settings)
     if settings.robust != "none":

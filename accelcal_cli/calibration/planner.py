@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.quality import Observability, design
+from accelcal_cli.calibration.quality import PRIOR, Observability, design
 from accelcal_cli.sensor.poses import corners, edges, faces
 from accelcal_cli.streams import Float
-
-PRIOR = 1e-6
-"""Information added to every parameter so that an undetermined one has a large, comparable variance: a sigma of
-1000 times the noise of a pose, far beyond any verdict's threshold."""
 
 
 def fixture_directions() -> Float:

@@ -42,81 +42,95 @@ class PoseResiduals:
 
 @dataclass(frozen=True)
 class Fit:
-    """Sums over all poses.
+    """Sums over all poses, and the poses that are kept.
 
     Attributes:
-        rms: of |f| - g, m/s^2.
+        rms, rms_before: of |f| - g after and before calibration, m/s^2.
         poses: the residuals that are kept, in the order of the poses.
     """
 
     rms: float
+    rms_before: float
     poses: PoseResiduals
 
 
-def rms_error(readings: Readings, model: ErrorModel, g: float) -> float:
-    """Return the rms of |f| - g over all poses, m/s^2."""
-    total = 0.0
-    for _, block in readings.blocks():
-        total += float(np.sum((np.linalg.norm(model.specific_force(block), axis=1) - g) ** 2))
-    return float(np.sqrt(total / readings.poses))
-
-
 def modulus_errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[tuple[int, Float, Float]]:
-    """Yield (first pose, e, u) block by block: e = (g^2 - |f|^2) / 2g, m/s^2, and u = f / |f|, shape (B, 3)."""
+    """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f in m/s^2, shapes (B,) and (B, 3)."""
     for first, block in readings.blocks():
         f = model.specific_force(block)
-        square = np.einsum("ji,ji->j", f, f)
-        yield first, (g * g - square) / (2.0 * g), f / np.sqrt(square)[:, None]
+        yield first, (g * g - np.einsum("ij,ij->j", f.T, f.T)) / (2.0 * g), f
+
+
+def square_error(e: Float, g: float) -> float:
+    """Return the sum of (|f| - g)^2 in (m/s^2)^2 from e, shape (B,)."""
+    error = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
+    return float(np.sum(error * error))
 
 
 def examine(
     readings: Readings,
     model: ErrorModel,
+    before: ErrorModel,
     g: float,
     cofactor: Float,
     weights: Float | None,
-    freedom: int,
     robust: Callable[[Float], Float] | None = None,
 ) -> Fit:
     """Return the fit of a model in gauge `lower`, pose by pose.
 
     Args:
         readings: J poses.
-        model: the calibrated sensor, gauge `lower`.
+        model: the calibrated sensor, gauge `lower`; before: what the readings were taken for without it.
         g: local gravity, m/s^2.
         cofactor: (J^T W J)^-1, shape (9, 9).
         weights: shape (J,) or None.
-        freedom: J - 9; studentised residuals need at least 2.
         robust: the weight that a robust fit gave a weighted residual, m/s^2; None after least squares.
     """
-    square_sum, weighted_sum = 0.0, 0.0
+    after_sum, before_sum, weighted_sum = 0.0, 0.0, 0.0
     parts: list[tuple[Int, Float, Float, Float]] = []
-    for first, e, u in modulus_errors(readings, model, g):
+    uncalibrated = modulus_errors(readings, before, g)
+    for (first, e, f), (_, e_before, _) in zip(modulus_errors(readings, model, g), uncalibrated, strict=True):
         w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
+        after_sum += square_error(e, g)
+        before_sum += square_error(e_before, g)
         if robust is not None:
             w = w * robust(np.sqrt(w) * e)
-        rows = design(u)
-        leverage = np.minimum(w * np.einsum("jp,pq,jq->j", rows, cofactor, rows), 1.0)
-        error = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
-        square_sum += float(np.sum(error**2))
-        weighted_sum += float(np.sum(w * e**2))
-        parts.append(_keep(np.arange(first, first + len(e)), error, leverage, np.sqrt(w) * e, readings.poses))
-    pose, error, leverage, scaled = (np.concatenate(column) for column in zip(*parts, strict=True))
+        scaled = np.sqrt(w) * e
+        weighted_sum += float(np.sum(scaled * scaled))
+        kept = _worst(scaled) if readings.poses > KEPT else np.arange(len(e))
+        parts.append((first + kept, scaled[kept], w[kept], f[kept]))
+    pose, scaled, w, f = (np.concatenate(column) for column in zip(*parts, strict=True))
     if readings.poses > KEPT:
-        worst = np.sort(np.argsort(-np.abs(scaled), kind="stable")[:KEPT_WORST])
-        pose, error, leverage, scaled = pose[worst], error[worst], leverage[worst], scaled[worst]
-    room = 1.0 - leverage
-    # A pose that the fit follows completely (leverage 1) has no error of its own to judge it by.
-    own = np.where(room > 1e-9, room, np.nan)
-    if freedom >= 2:
-        others = np.maximum(weighted_sum - scaled**2 / own, 0.0) / (freedom - 1)
-        studentised = scaled / np.sqrt(np.where(others > 0, others, np.nan) * own)
-    else:
-        studentised = np.full(len(pose), np.nan)
+        kept = np.sort(_worst(scaled))
+        pose, scaled, w, f = pose[kept], scaled[kept], w[kept], f[kept]
+    residuals = _judge(pose, scaled, w, f, g, cofactor, weighted_sum, readings.poses - 9)
     return Fit(
-        float(np.sqrt(square_sum / readings.poses)),
-        PoseResiduals(pose, error, leverage, -studentised, error / own),
+        float(np.sqrt(after_sum / readings.poses)), float(np.sqrt(before_sum / readings.poses)), residuals
     )
+
+
+def _worst(scaled: Float) -> Int:
+    """Return the indices of the largest residuals, at most KEPT_WORST."""
+    return np.argpartition(-np.abs(scaled), min(KEPT_WORST, len(scaled)) - 1)[:KEPT_WORST]
+
+
+def _judge(
+    pose: Int, scaled: Float, w: Float, f: Float, g: float, cofactor: Float, weighted_sum: float, freedom: int
+) -> PoseResiduals:
+    """Return residuals with their leverage, studentised and with the pose left out.
+
+    Studentised residuals need freedom >= 2; `scaled` is sqrt(w) e and `weighted_sum` its squares over all poses.
+    """
+    size = np.linalg.norm(f, axis=1)
+    rows = design(f / size[:, None])
+    leverage = np.minimum(w * np.einsum("jp,pq,jq->j", rows, cofactor, rows), 1.0)
+    # A pose that the fit follows completely (leverage 1) has no error of its own to judge it by.
+    room = np.where(leverage < 1.0 - 1e-9, 1.0 - leverage, np.nan)
+    studentised = np.full(len(pose), np.nan)
+    if freedom >= 2:
+        others = np.maximum(weighted_sum - scaled**2 / room, 0.0) / (freedom - 1)
+        studentised = -scaled / np.sqrt(np.where(others > 0, others, np.nan) * room)
+    return PoseResiduals(pose, size - g, leverage, studentised, (size - g) / room)
 
 
 def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:
@@ -133,12 +147,3 @@ def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:
     chance = 2.0 * poses * stdtr(freedom - 1, -size)
     named: Int = residuals.pose[suspect & (chance < OUTLIER_LEVEL)]
     return named
-
-
-def _keep(
-    pose: Int, error: Float, leverage: Float, scaled: Float, poses: int
-) -> tuple[Int, Float, Float, Float]:
-    if poses > KEPT and len(pose) > KEPT_WORST:
-        worst = np.argpartition(-np.abs(scaled), KEPT_WORST)[:KEPT_WORST]
-        return pose[worst], error[worst], leverage[worst], scaled[worst]
-    return pose, error, leverage, scaled

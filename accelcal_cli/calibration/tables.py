@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from accelcal_cli.calibration.quality import UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration
@@ -21,12 +22,13 @@ def tables(result: Calibration) -> list[Table]:
 
 def parameters(result: Calibration) -> Table:
     """Return K_a and D_a with their one-sigma."""
+    lost = _undetermined(result)
     rows = []
     for i in range(3):
         row: list[object] = [AXES[i]]
         for j in range(3):
-            row += _pair(result, result.K_a[i, j], result.sigma.K_a[i, j])
-        row += _pair(result, result.D_a[i], result.sigma.D_a[i])
+            row += _pair(result.K_a[i, j], result.sigma.K_a[i, j], lost=bool(lost[i, j]))
+        row += _pair(result.D_a[i], result.sigma.D_a[i], lost=bool(lost[3, i]))
         rows.append(row)
     columns = [Column("axis")]
     for name in ("K_x", "K_y", "K_z", "bias"):
@@ -41,13 +43,27 @@ def parameters(result: Calibration) -> Table:
     return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
 
 
-def _pair(result: Calibration, value: float, sigma: float) -> list[object]:
+def _lost(result: Calibration) -> NDArray[np.bool_]:
+    """Return which of the nine parameters are undetermined, shape (9,): all of them with fewer than nine poses."""
+    return (np.array(list(result.dop.parameters.values())) > UNDETERMINED) | (result.freedom < 0)
+
+
+def _undetermined(result: Calibration) -> NDArray[np.bool_]:
+    """Return which entries of K_a (rows 0 to 2) and D_a (row 3) the poses leave undetermined, shape (4, 3)."""
+    dop = _lost(result)
+    lost = np.zeros((4, 3), dtype=bool)
+    for p, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))):
+        lost[i, j] = lost[j, i] = dop[p]
+    lost[3] = dop[6:]
+    lost[:3] &= result.K_a != 0  # a zero of the gauge is exact
+    return lost
+
+
+def _pair(value: float, sigma: float, *, lost: bool) -> list[object]:
     """Return a value and its sigma; a value that the poses do not determine is not shown as one."""
-    if np.isfinite(sigma):
-        return [value, sigma]
-    if result.verdict == "undetermined" and result.gauge != "full":
+    if lost:
         return [UNKNOWN, None]
-    return [value, None]
+    return [value, sigma if np.isfinite(sigma) else None]
 
 
 def engineering(result: Calibration) -> Table:
@@ -58,6 +74,8 @@ def engineering(result: Calibration) -> Table:
     scale = units.scale_error(result.K_a, result.nominal_scale)
     angle = units.misalignment(result.K_a)
     bias = units.bias_force(result.K_a, result.D_a - result.nominal_bias)
+    lost = _lost(result)
+    sigma = np.where(lost, np.nan, sigma)
     rows = [_row(f"scale factor error {AXES[i]}", scale[i], sigma[i] / per_g, "ppm", "%") for i in range(3)]
     for p, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
         value = angle[i, j] + angle[j, i]

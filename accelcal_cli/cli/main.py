@@ -15,6 +15,10 @@ from accelcal_cli.errors import AccelcalError
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
+for library in ("OPENBLAS", "OMP", "MKL"):
+    # Our matrices are small: threads only wait for each other, and a result must not depend on their number.
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
 app = typer.Typer(
     name="accelcal",
     help="Calibrate three-axis accelerometers without a turntable.",

@@ -114,7 +114,9 @@ def _solve(state: DampedState, held: Bool) -> Float:
     diagonal = np.where(held, 1.0, np.einsum("rpdd->rpd", matrix) + state.damping[..., None] * scale)
     index = np.arange(matrix.shape[-1])
     matrix[..., index, index] = diagonal
-    usable: Bool = np.isfinite(matrix).all(axis=(2, 3)) & np.isfinite(state.gradient).all(axis=2)
+    usable: Bool = np.logical_and(
+        np.isfinite(matrix).all(axis=(2, 3)), np.isfinite(state.gradient).all(axis=2)
+    )
     matrix = np.where(usable[..., None, None], matrix, np.eye(len(index)))
     right = np.where(held | ~usable[..., None], 0.0, -state.gradient)
     step: Float = np.linalg.solve(matrix, right[..., None])[..., 0]

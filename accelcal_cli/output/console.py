@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable
 from typing import IO
 
+from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -27,20 +28,48 @@ def console(file: IO[str] | None = None) -> Console:
 
 
 def show(tables: Iterable[Table], out: Console) -> None:
-    """Draw tables one under the other, each with its notes."""
+    """Draw tables one under the other, each with its notes; one too wide for the terminal row by row."""
     for table in tables:
-        drawn = RichTable(title=table.title, title_justify="left", title_style="bold", box=_box(out))
-        for column in table.columns:
-            heading = f"{column.name}\n[{column.unit}]" if column.unit else column.name
-            numeric = bool(column.format)
-            drawn.add_column(heading, justify="right" if numeric else "left", no_wrap=numeric)
-        for row in table.rows:
-            drawn.add_row(*(column.text(value) for column, value in zip(table.columns, row, strict=True)))
-        if table.columns:
-            out.print(drawn)
+        if _natural_width(table) > out.width:
+            _show_stacked(table, out)
+        elif table.columns:
+            out.print(_drawn(table, out))
         for note in table.notes:
             out.print(Text(note))
         out.print()
+
+
+def _natural_width(table: Table) -> int:
+    """Return the characters that a table needs without wrapping a cell."""
+    widths = [
+        max(map(len, [column.name, f"[{column.unit}]", *(column.text(row[i]) for row in table.rows)]))
+        for i, column in enumerate(table.columns)
+    ]
+    return sum(widths) + 2 * len(widths) + 2
+
+
+def _show_stacked(table: Table, out: Console) -> None:
+    """Print every row as a heading and one line a column, so that a narrow terminal loses no digit."""
+    out.print(Text(table.title, "bold"))
+    for row in table.rows:
+        first, *rest = zip(table.columns, row, strict=True)
+        out.print(Text(first[0].text(first[1])))
+        for column, value in rest:
+            cell = column.text(value)
+            if cell not in ("", "-"):
+                unit = f" {column.unit}" if column.unit else ""
+                out.print(Text(f"  {column.name or 'note'} {cell}{unit}"))
+
+
+def _drawn(table: Table, out: Console) -> RichTable:
+    """Return a table as rich draws it."""
+    drawn = RichTable(title=table.title, title_justify="left", title_style="bold", box=_box(out))
+    for column in table.columns:
+        heading = f"{column.name}\n[{column.unit}]" if column.unit else column.name
+        drawn.add_column(heading, justify="right" if column.format else "left", no_wrap=True)
+    for row in table.rows:
+        drawn.add_row(*(column.text(value) for column, value in zip(table.columns, row, strict=True)))
+    return drawn
 
 
 def verdict(word: str, sentences: Iterable[str], out: Console) -> None:
@@ -50,7 +79,5 @@ def verdict(word: str, sentences: Iterable[str], out: Console) -> None:
         out.print(Text(f"  {sentence}"))
 
 
-def _box(out: Console):  # type: ignore[no-untyped-def]
-    from rich import box
-
+def _box(out: Console) -> box.Box:
     return box.SIMPLE_HEAD if out.encoding.lower().startswith("utf") else box.ASCII2

@@ -72,7 +72,7 @@ class Collector:
         self.extent.add(output)
         if self.extent.stuck and self.extent.rows >= STUCK:
             raise DataError(
-                f"{self.source}: the first {self.extent.rows:,} readings are all equal: {self._value()}"
+                f"{self.source}: the first {self.extent.rows:,} readings are all equal, {self._value()}"
             )
         if self._means is None:
             self.store.append(output)
@@ -88,7 +88,10 @@ class Collector:
             count = "no readings" if not self.store.rows else "only one pose"
             raise DataError(f"{self.source}: holds {count}; a calibration needs at least nine poses")
         if self.extent.stuck:
-            raise DataError(f"{self.source}: all {self.store.rows:,} readings are equal: {self._value()}")
+            raise DataError(
+                f"{self.source}: all {self.store.rows:,} readings are equal, {self._value()}; "
+                "the sensor has to be turned between them"
+            )
         return extras
 
     def _value(self) -> str:

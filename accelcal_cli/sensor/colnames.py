@@ -38,6 +38,7 @@ class Roles:
     label: int | None = None
     count: int | None = None
     temperature: int | None = None
+    doubtful: list[str] = field(default_factory=list)  # names that come twice where one is needed
     other: set[int] = field(default_factory=set)  # known to be no readings: time, row number
     partial: list[str] = field(default_factory=list)  # triples that lack an axis, in words
 
@@ -71,6 +72,12 @@ def recognise(names: Sequence[str]) -> Roles:
         elif found := _axis(key, _OUTPUT):
             _put(output, found, column)
     roles.families = {_title(names, triple): triple for triple in _triples(output).values()}
+    roles.doubtful = [
+        names[column]
+        for (_, turn), by in output.items()
+        if turn and len(by) < len(AXES)
+        for column in by.values()
+    ]
     for (family, _), triple in _triples(spread).items():
         roles.scatter.setdefault(family, triple)
     roles.reference = next(iter(_triples(reference).values()), None)

@@ -55,7 +55,7 @@ def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
         output = _only_family(table, roles)
     else:
         output = _only_numeric(table, names, roles)
-        note = (f"columns {_listed(names, output)} taken as x, y, z: the only three numeric ones",)
+        note = (f"columns {_listed(names, output)} taken as x, y, z: the only three that can be",)
     return _with_extras(table, output, roles, note)
 
 
@@ -71,9 +71,9 @@ def _stated(table: Table, wanted: Sequence[str]) -> Triple:
 
 
 def _column(table: Table, word: str) -> int:
-    """Find a column by exact name, by name in any case, or by number."""
+    """Find a column by exact name, by name in any case or without its unit, or by number."""
     names, width = table.names, len(table.numeric)
-    for fold in (str, str.lower):
+    for fold in (str, str.lower, _bare_name):
         matches = [k for k, name in enumerate(names or ()) if fold(name) == fold(word)]
         if len(matches) > 1:
             numbers = " or ".join(str(k + 1) for k in matches)
@@ -110,13 +110,20 @@ def _only_family(table: Table, roles: Roles) -> Triple:
         raise DataError(
             f"{table.name}: the readings could be {' or '.join(roles.families)}; say which with --columns"
         )
+    if roles.doubtful:
+        raise DataError(
+            f'{table.name}: more than one column could be "{roles.doubtful[0]}"; '
+            "say which to use with --columns and column numbers"
+        )
     return next(iter(roles.families.values()))
 
 
 def _only_numeric(table: Table, names: Sequence[str], roles: Roles) -> Triple:
     known = {*(roles.reference or ()), roles.count, roles.temperature, roles.label, *roles.other}
     known.update(column for triple in roles.scatter.values() for column in triple)
-    left = [k for k, numeric in enumerate(table.numeric) if numeric and k not in known]
+    left = [k for k in range(len(names)) if k not in known]
+    if len(left) > 3:
+        left = [k for k in left if table.numeric[k]]
     if len(left) == 3:
         return left[0], left[1], left[2]
     if len(names) < 3:
@@ -165,6 +172,10 @@ def _scatter_of(names: Sequence[str] | None, output: Triple, roles: Roles) -> Tr
 def _listed(names: Sequence[str], columns: Sequence[int]) -> str:
     listed = ", ".join(f'"{names[k]}"' for k in columns[:20])
     return listed + (f" and {len(columns) - 20} more" if len(columns) > 20 else "")
+
+
+def _bare_name(name: str) -> str:
+    return "".join(tokens_of(name))
 
 
 def _plural(columns: int) -> str:

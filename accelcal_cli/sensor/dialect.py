@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from accelcal_cli.errors import DataError
@@ -116,26 +115,32 @@ def decode_line(raw: bytes, number: int, source: str, *, strict: bool = True) ->
 
 
 def _separator(lines: list[str]) -> str:
-    """Separator of the data lines: the one under which most cells are numbers, when it is in doubt."""
-    bare = [_QUOTED.sub("0", line) for line in lines[:64]]
-    if 2 * sum(";" in line for line in bare) > len(bare):
-        return ";"
-    if 2 * sum("\t" in line.strip() for line in bare) > len(bare):
-        gaps = any("" in line.strip("\r\n").split("\t")[:-1] for line in bare)
-        return " " if gaps else "\t"
-    if not any("," in line for line in bare):
-        return " "
-    comma = _numeric_share(cell for line in bare for cell in line.split(","))
-    words = (cell for line in bare for cell in line.split())
-    blank = _numeric_share(
-        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in words
-    )
-    return " " if blank > comma else ","
+    """Separator of the data lines: the one under which the largest share of cells are numbers."""
+    bare = [_QUOTED.sub("0", line.strip("\r\n")) for line in lines[:64]]
+    best, share = " ", -1.0
+    for separator in (";", "\t", ",", " "):
+        if 2 * sum(separator in line.strip() for line in bare) <= len(bare):
+            continue
+        rows = [split_cells(line, separator) for line in bare]
+        numeric = _numeric_share(rows, decimal_comma=separator != ",")
+        # aligned columns: tabs in runs, which would else be empty cells
+        aligned = separator == " " and best == "\t" and numeric == share and _uneven("\t", " ", bare)
+        if numeric > share or aligned:
+            best, share = separator, numeric
+    return best
 
 
-def _numeric_share(cells: Iterable[str]) -> float:
-    flags = [looks_numeric(cell, decimal_comma=False) for cell in cells]
-    return sum(flags) / max(len(flags), 1)
+def _numeric_share(rows: list[list[str]], *, decimal_comma: bool) -> float:
+    cells = [cell for row in rows for cell in row if cell]
+    numeric = sum(_DECIMAL_COMMA.fullmatch(cell) is not None for cell in cells) if decimal_comma else 0
+    return (numeric + sum(looks_numeric(cell, decimal_comma=False) for cell in cells)) / max(len(cells), 1)
+
+
+def _uneven(first: str, second: str, lines: list[str]) -> bool:
+    """Whether `first` leaves rows of different widths and `second` does not."""
+    widths = [{len(split_cells(line.strip(), separator)) for line in lines} for separator in (first, second)]
+    gaps = any("" in split_cells(line.strip(), first) for line in lines)
+    return (len(widths[0]) > 1 or gaps) and len(widths[1]) == 1
 
 
 def _decimal_comma(lines: list[str], separator: str) -> bool:
@@ -153,8 +158,8 @@ def _decimal_comma(lines: list[str], separator: str) -> bool:
 
 def _header_cells(line: str, separator: str) -> list[str]:
     """Cells of a header; a unit in brackets belongs to the name before it, blank or not."""
-    if separator == " ":
-        line = re.sub(r"\s+(?=[\[(])", "", line)
+    if separator == " " and '"' not in line:
+        return re.split(r"\s+(?![\[(])", line.strip())
     return split_cells(line, separator)
 
 

@@ -26,19 +26,30 @@ class FastParser:
 
     def parse(self, block: bytes) -> Rows:
         """Rows of a block of whole lines."""
-        plain = self._plain(block)
-        frame = None if plain is None else self._frame(plain)
-        numbers = None if frame is None else self._numbers(frame)
-        if frame is None or numbers is None:
-            return self.careful.parse(block)
-        column = self.careful.selection.text
-        text = None if column is None else frame[str(column)].to_list()
-        return Rows(self.careful.skip(len(numbers)), numbers, text)
+        for form in (self._bare, self._plain):
+            plain = form(block)
+            frame = None if plain is None else self._frame(plain)
+            numbers = None if frame is None else self._numbers(frame)
+            text = None if frame is None else self._text(frame)
+            if numbers is not None and text is not None:
+                asked = self.careful.selection.text is not None
+                return Rows(self.careful.skip(len(numbers)), numbers, text if asked else None)
+        return self.careful.parse(block)
+
+    def _bare(self, block: bytes) -> bytes | None:
+        """The block as it is, where every column is read as a number, so that nothing odd can hide."""
+        dialect, selection = self.careful.dialect, self.careful.selection
+        if len(set(selection.numbers)) < dialect.width or selection.text is not None:
+            return None
+        doubtful = dialect.decimal_comma or not block.endswith(b"\n") or _has_outer_blank_line(block)
+        return None if doubtful else block
 
     def _plain(self, block: bytes) -> bytes | None:
         """The block with one-byte separators only, or None if it needs care."""
         dialect = self.careful.dialect
         if b'"' in block or b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+            return None
+        if self.careful.selection.text in self.careful.selection.numbers:
             return None
         if dialect.decimal_comma and (b"." in block or dialect.separator == ","):
             return None
@@ -47,8 +58,7 @@ class FastParser:
         if b"\r" in block:
             block = block.replace(b"\r\n", b"\n")
         block = _squeeze(block, dialect.separator.encode())
-        odd = b"\r" in block or block.startswith(b"\n") or block.endswith(b"\n\n")
-        return None if odd else block
+        return None if b"\r" in block or _has_outer_blank_line(block) else block
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
@@ -82,6 +92,19 @@ class FastParser:
             numbers[:, k] = series.to_numpy()
         sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
         return numbers if sound else None
+
+    def _text(self, frame: pl.DataFrame) -> list[str] | None:
+        """Stripped text of the text column, [] where none is asked for, None where a cell is empty."""
+        column = self.careful.selection.text
+        if column is None:
+            return []
+        text = [(cell or "").strip() for cell in frame[str(column)].to_list()]
+        return text if all(text) else None
+
+
+def _has_outer_blank_line(block: bytes) -> bool:
+    """Whether a block begins or ends with a blank line; polars passes over these without a null."""
+    return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
 
 
 def _is_utf8(block: bytes) -> bool:

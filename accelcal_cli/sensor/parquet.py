@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.beside import Beside
 from accelcal_cli.sensor.cells import LIMIT, Rows, Selection
 from accelcal_cli.sensor.source import ByteSource
 
@@ -22,16 +24,14 @@ class ParquetTable:
 
     has_rows: bool
 
-    def __init__(self, source: ByteSource) -> None:
-        """Copy `source` to a temporary file, for Parquet is read from its end, and look at its schema.
-
-        The copy is what the hash speaks of, even if the original changes meanwhile.
-        """
+    def __init__(self, source: ByteSource, path: Path | None) -> None:
+        """Look at the schema. Without a `path` (standard input) make a copy: Parquet starts at its end."""
         self.name = source.name
         self._source = source
+        self._hashing = Beside()
         self._files = ExitStack()
         try:
-            self._path = self._copy()
+            self._path = path or self._copy()
             with _named_errors(self.name):
                 frame = pl.scan_parquet(self._path)
                 schema = frame.collect_schema()
@@ -39,12 +39,14 @@ class ParquetTable:
         except BaseException:
             self._files.close()
             raise
+        self._hashing.start(lambda: deque(source.rest(), maxlen=0))
         self.names: tuple[str, ...] = tuple(schema)
         self.numeric = tuple(kind.is_numeric() for kind in schema.values())
 
     @property
     def sha256(self) -> str:
         """SHA-256 of the file."""
+        self._hashing.wait()
         return self._source.sha256
 
     def blocks(self, selection: Selection) -> Iterator[Rows]:
@@ -68,6 +70,7 @@ class ParquetTable:
 
     def close(self) -> None:
         """Remove the copy and close the file."""
+        self._hashing.wait()
         self._files.close()
         self._source.close()
 
@@ -92,9 +95,15 @@ class ParquetTable:
         ]
         if selection.text is not None:
             wanted.append(pl.col(self.names[selection.text]).cast(pl.String).alias("text"))
-        frame = pl.scan_parquet(self._path).select(wanted)
-        with _named_errors(self.name):
-            yield from frame.collect_batches(chunk_size=ROWS, maintain_order=True)
+        lazy = pl.scan_parquet(self._path).select(wanted)
+        start = 0
+        while True:
+            with _named_errors(self.name):
+                frame = lazy.slice(start, ROWS).collect()
+            if frame.is_empty():
+                return
+            yield frame
+            start += frame.height
 
     def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
         bad = ~(np.abs(numbers) <= LIMIT)

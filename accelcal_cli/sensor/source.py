@@ -38,11 +38,13 @@ class ByteSource:
         self._stream = stream
         self._block = block
         self._hash = hashlib.sha256()
-        self._hashing = Beside()
+        self._hashing, self._reading = Beside(), Beside()
+        self._may_read_ahead = stream.seekable()  # a pipe may block, and with it the end of the program
+        self._ahead: bytes | None = None
         raw = self._read(head)
         self.whole = len(raw) < head  # the head is all there is
         self._hash.update(raw)
-        self._carriage_returns = b"\n" not in raw and b"\r" in raw  # line ends of old Macs
+        self._carriage_returns = b"\n" not in raw and b"\r" in raw[:-1]  # line ends of old Macs
         self.head = self._unify(raw)
         for magic, what in _FOREIGN.items():
             if raw.startswith(magic):
@@ -50,6 +52,7 @@ class ByteSource:
 
     def close(self) -> None:
         """Close the file (standard input stays open)."""
+        self._reading.wait()
         if self._stream is not sys.stdin.buffer:
             self._stream.close()
 
@@ -84,10 +87,17 @@ class ByteSource:
             yield fresh
 
     def _next(self) -> bytes:
-        raw = self._read(self._block)
+        """Take the block read ahead, have the next one read, and hash this one, beside the parser."""
+        self._reading.wait()
+        raw = self._ahead if self._ahead is not None else self._read(self._block)
+        if raw and self._may_read_ahead:
+            self._reading.start(self._read_ahead)
         if raw:
             self._hashing.start(lambda: self._hash.update(raw))
         return self._unify(raw)
+
+    def _read_ahead(self) -> None:
+        self._ahead = self._read(self._block)
 
     def _unify(self, raw: bytes) -> bytes:
         return raw.replace(b"\r", b"\n") if self._carriage_returns else raw

@@ -103,6 +103,6 @@ def _named_disk_errors() -> Iterator[None]:
         from tempfile import gettempdir
 
         raise DataError(
-            f"{gettempdir()}: no room for the readings beyond {IN_MEMORY:,} rows "
+            f"{gettempdir()}: the temporary file for more than {IN_MEMORY:,} readings failed "
             f"({problem.strerror or problem}); free some space, or set TMPDIR to a larger folder"
         ) from problem

@@ -89,17 +89,17 @@ def open_table(source: str | Path, stdin: BinaryIO | None = None) -> Table:
     """Open a table of any supported form; ``-`` is standard input."""
     stream = open_source(source, stdin)
     try:
-        return _table(stream, Path(source))
+        return _table(stream, None if str(source) == "-" else Path(source))
     except BaseException:
         stream.close()
         raise
 
 
-def _table(stream: ByteSource, path: Path) -> Table:
-    if stream.head.startswith(b"PAR1") or path.suffix.lower() in {".parquet", ".pq"}:
+def _table(stream: ByteSource, path: Path | None) -> Table:
+    if stream.head.startswith(b"PAR1") or (path is not None and path.suffix.lower() in {".parquet", ".pq"}):
         from accelcal_cli.sensor.parquet import ParquetTable
 
-        return ParquetTable(stream)
+        return ParquetTable(stream, path)
     return TextTable(stream)
 
 
