@@ -19,6 +19,7 @@ class Problem(ABC):
     Attributes:
         name: for tables.
         lower, upper: the box, shape (D,).
+        start: low and high corner of where starting points are drawn; None is the whole box.
         minimum: the known least cost, or None.
         has_residuals: whether `residuals` and `jacobian` exist, with cost = sum of squared residuals.
         has_closed_form: whether `closed_form` exists.
@@ -27,6 +28,7 @@ class Problem(ABC):
     name: str
     lower: Float
     upper: Float
+    start: tuple[Float, Float] | None = None
     minimum: float | None = None
     has_residuals: bool = False
     has_closed_form: bool = False

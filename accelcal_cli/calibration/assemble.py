@@ -114,14 +114,6 @@ def _variance(
     return solution.cost / (4.0 * settings.g**2) / freedom  # L = sum (2 g e)^2
 
 
-def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:
-    """Return the weight that the robust fit gave a residual in m/s^2; None when all counted alike."""
-    noise = solution.noise
-    if noise is None or noise <= NO_NOISE * settings.g:
-        return None
-    return lambda e: loss_weight(e / noise, settings.robust)
-
-
 def _first_sight(
     solution: Solution, start: Start, information: Float, seen: Observability, poses: int
 ) -> tuple[Float, Observability]:
@@ -136,6 +128,14 @@ def _first_sight(
     said = quality.information(nine, point)[0]
     first = Observability.of(said, poses)
     return (said, first) if first.verdict == "undetermined" else (information, seen)
+
+
+def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:
+    """Return the weight that the robust fit gave a residual in m/s^2; None when all counted alike."""
+    noise = solution.noise
+    if noise is None or noise <= NO_NOISE * settings.g:
+        return None
+    return lambda e: loss_weight(e / noise, settings.robust)
 
 
 def _suggest(information: Float, seen: Observability) -> tuple[str, ...]:

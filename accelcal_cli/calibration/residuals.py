@@ -91,10 +91,10 @@ def examine(
     uncalibrated = modulus_errors(readings, before, g)
     for (first, e, f), (_, e_before, _) in zip(modulus_errors(readings, model, g), uncalibrated, strict=True):
         w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
-        after_sum += square_error(e, g)
-        before_sum += square_error(e_before, g)
         if robust is not None:
             w = w * robust(np.sqrt(w) * e)
+        after_sum += square_error(e, g)
+        before_sum += square_error(e_before, g)
         scaled = np.sqrt(w) * e
         weighted_sum += float(np.sum(scaled * scaled))
         kept = _worst(scaled) if readings.poses > KEPT else np.arange(len(e))

@@ -119,7 +119,7 @@ class _Loop:
         rng = Streams(seed, numbers.tolist())
         counted = Counted(self.problem, runs)
         if x is None:
-            lower, upper = self.problem.lower, self.problem.upper
+            lower, upper = self.problem.start or (self.problem.lower, self.problem.upper)
             x = lower + (upper - lower) * rng.uniform(self.optimizer.population, lower.size)
         state = self.optimizer.init(counted, x, rng)
         alive: Int = np.arange(runs)

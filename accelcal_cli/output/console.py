@@ -14,7 +14,7 @@ from rich.text import Text
 
 from accelcal_cli.table import Table
 
-PIPE_WIDTH = 120
+PIPE_WIDTH = 160
 """Columns of a table that goes into a pipe or a file, where no terminal sets a limit."""
 
 VERDICT_STYLE = {"good": "bold green", "weak": "bold yellow", "undetermined": "bold red"}

@@ -1,0 +1,182 @@
+"""What a study is: cells (a problem and an optimizer), runs of each, and the records they leave.
+
+A study is plain data, so that it can be hashed, sent to a worker and repeated. A task is a block of runs of one
+cell; its records depend on nothing but the study and the numbers of the runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer
+from accelcal_cli.optimizers.minimize import Run
+from accelcal_cli.streams import Float
+
+TRACE_POINTS = 200
+"""Points of a record's convergence curve."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An optimizer in a study.
+
+    Attributes:
+        label: how the tables name it.
+        optimizer: its name; parameters: what differs from its defaults.
+    """
+
+    label: str
+    optimizer: str
+    parameters: dict[str, Any]
+
+    def build(self) -> Optimizer:
+        """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
+        return OPTIMIZERS.build(self.optimizer, self.parameters, f"{self.label}")
+
+
+@dataclass(frozen=True)
+class Task:
+    """Runs `first` to `last` - 1 of cell number `cell`."""
+
+    cell: int
+    first: int
+    last: int
+
+    @property
+    def key(self) -> str:
+        """Its name in a journal."""
+        return f"{self.cell}:{self.first}:{self.last}"
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run.
+
+    Attributes:
+        cell, run: which.
+        cost: best cost; evaluations, iterations: used; status: how it ended.
+        hit: evaluations when the cost first was at or below the tolerance, or None.
+        values: further results of the kind of study (parameter errors, ...), by name.
+        curve: pairs (evaluations, best cost so far), thinned.
+        seconds: wall time of the run: its share of its block's.
+    """
+
+    cell: int
+    run: int
+    cost: float
+    evaluations: int
+    iterations: int
+    status: str
+    hit: int | None
+    values: dict[str, float | None]
+    curve: tuple[tuple[int, float], ...]
+    seconds: float
+
+    @classmethod
+    def from_json(cls, record: dict[str, Any]) -> Record:
+        """Return the record of a journal's line."""
+        return cls(**{**record, "curve": tuple((int(n), float(c)) for n, c in record["curve"])})
+
+
+class Study(ABC):
+    """A study; its dataclass fields are all that decides its records."""
+
+    @property
+    @abstractmethod
+    def cells(self) -> int:
+        """How many cells it has."""
+
+    @property
+    @abstractmethod
+    def runs(self) -> int:
+        """Runs of each cell."""
+
+    @property
+    def block(self) -> int:
+        """Runs of one task: the unit that is kept when a study is interrupted."""
+        return 20
+
+    @abstractmethod
+    def execute(self, task: Task) -> list[Record]:
+        """Return the records of a task's runs."""
+
+    @property
+    def identity(self) -> str:
+        """Hash of everything that decides the records."""
+        text = json.dumps([type(self).__name__, asdict(self)], sort_keys=True, default=str)  # type: ignore[call-overload]
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def tasks(self) -> list[Task]:
+        """Return all tasks, cell by cell."""
+        return [
+            Task(cell, first, min(first + self.block, self.runs))
+            for cell in range(self.cells)
+            for first in range(0, self.runs, self.block)
+        ]
+
+
+def records_of(
+    task: Task,
+    run: Run,
+    tolerance: float | None,
+    seconds: float,
+    values: Sequence[dict[str, float | None]] | None = None,
+) -> list[Record]:
+    """Return the records of a block of runs.
+
+    Args:
+        task: whose runs they are.
+        run: what `minimize` returned, with its trace.
+        tolerance: cost that counts as a hit; None has no hits.
+        seconds: wall time of the block.
+        values: further results of each run.
+    """
+    return [
+        Record(
+            task.cell,
+            int(number),
+            float(run.cost[i]),
+            int(run.evaluations[i]),
+            int(run.iterations[i]),
+            run.status[i].name.lower(),
+            _hit(run, i, tolerance),
+            dict(values[i]) if values else {},
+            _curve(run, i),
+            seconds / len(run.runs),
+        )
+        for i, number in enumerate(run.runs)
+    ]
+
+
+def _hit(run: Run, i: int, tolerance: float | None) -> int | None:
+    if tolerance is None or run.trace is None or run.trace_evaluations is None:
+        return None
+    reached = np.flatnonzero(run.trace[i] <= tolerance)
+    return int(run.trace_evaluations[i][reached[0]]) if len(reached) else None
+
+
+def _curve(run: Run, i: int) -> tuple[tuple[int, float], ...]:
+    if run.trace is None or run.trace_evaluations is None:
+        return ()
+    last = int(run.iterations[i]) + 1
+    keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, TRACE_POINTS))})
+    counts, costs = run.trace_evaluations[i][keep], run.trace[i][keep]
+    return tuple((int(n), float(c)) for n, c in zip(counts, costs, strict=True) if np.isfinite(c))
+
+
+def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float]:
+    """Return the median best cost of several runs against evaluations, both of shape (points,)."""
+    last = max(r.curve[-1][0] for r in records if r.curve)
+    grid = np.linspace(min(r.curve[0][0] for r in records if r.curve), last, points)
+    rows = []
+    for record in records:
+        counts, costs = np.array(record.curve).T
+        rows.append(costs[np.maximum(np.searchsorted(counts, grid, side="right") - 1, 0)])
+    return grid, np.median(rows, axis=0)
