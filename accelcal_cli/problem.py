@@ -166,11 +166,13 @@ class Counted(Problem):
 def differences(problem: Problem, x: Float) -> tuple[Float, Float]:
     """Return gradient and Hessian of a cost by central differences; see `Problem.gradient_hessian`.
 
-    The step is the fourth root of the rounding unit times the box, which balances truncation and rounding of a
+    The points stay in the box: next to a wall they are those of the nearest point that has room for them. The step
+    is the fourth root of the rounding unit times the box, which balances truncation and rounding of a
     second difference.
     """
     D = problem.dimensions
     h = np.finfo(float).eps ** 0.25 * 0.5 * (problem.upper - problem.lower)
+    x = np.clip(x, problem.lower + 2.0 * h, problem.upper - 2.0 * h)
     f0 = problem.cost(x)
     steps = np.diag(h)
     plus = np.stack([problem.cost(x + steps[i]) for i in range(D)], axis=-1)

@@ -118,6 +118,14 @@ class Watched(Problem):
     def closed_form(self):
         return self.problem.closed_form()
 
+    @property
+    def units(self):
+        return self.problem.units
+
+    @property
+    def groups(self):
+        return self.problem.groups
+
     def take(self, index):
         return Watched(self.problem.take(index), self.seen)
 

@@ -97,10 +97,20 @@ def test_a_problem_offers_only_what_it_has():
     assert isinstance(sphere, Problem)
 
 
-def test_a_wrapped_problem_shows_its_own_attributes():
-    assert Counted(ShiftedSphere(), 1).solution.shape == (4,)
-    with pytest.raises(AttributeError):
-        _ = Counted(ShiftedSphere(), 1).no_such_attribute
+def test_a_wrapped_problem_shows_units_and_groups():
+    class Scaled(ShiftedSphere):
+        @property
+        def units(self):
+            return np.array([1.0, 2.0, 3.0, 4.0])
+
+        @property
+        def groups(self):
+            return np.array([0, 0, 1, 1])
+
+    assert Counted(Scaled(), 1).units.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert Counted(Scaled(), 1).groups.tolist() == [0, 0, 1, 1]
+    assert ShiftedSphere().units.tolist() == [1.0] * 4
+    assert ShiftedSphere().groups.tolist() == [0] * 4
 
 
 @pytest.mark.parametrize(
@@ -122,3 +132,31 @@ def test_records_are_keyed_by_the_columns():
     assert table.records() == [{"a": 1, "b_2": 2}, {"a": 3, "b_2": 4}]
     with pytest.raises(ValueError):
         Table("t", (Column("a"),), ((1, 2),)).records()
+
+
+@pytest.mark.parametrize("make", [ShiftedSphere, Decay])
+def test_differences_of_the_cost(make):
+    """Gradient and Hessian by central differences: exact ones of the sphere, J^T J and J^T r of residuals near it."""
+    problem = make()
+    x = np.broadcast_to(problem.solution, (2, 3, problem.dimensions)) + 1e-3 * np.arange(6).reshape(2, 3, 1)
+    counted = Counted(problem, 2)
+    gradient, hessian = counted.gradient_hessian(x)
+    if make is ShiftedSphere:
+        np.testing.assert_allclose(gradient, 2 * (x - problem.solution), atol=1e-6)
+        np.testing.assert_allclose(hessian, np.broadcast_to(2 * np.eye(4), hessian.shape), atol=1e-5)
+    else:
+        J, r = problem.jacobian(x), problem.residuals(x)
+        np.testing.assert_allclose(gradient, 2 * np.einsum("rpmd,rpm->rpd", J, r), atol=1e-5)
+        np.testing.assert_allclose(hessian[0, 0], 2 * J[0, 0].T @ J[0, 0], rtol=1e-4)
+    D = problem.dimensions
+    assert counted.evaluations.tolist() == [3 * (1 + 2 * D + D * (D - 1))] * 2
+
+
+def test_an_analytic_hessian_counts_once():
+    class Known(ShiftedSphere):
+        def gradient_hessian(self, x):
+            return 2 * (x - self.solution), np.broadcast_to(2 * np.eye(4), (*x.shape, 4))
+
+    counted = Counted(Known(), 1)
+    counted.gradient_hessian(_points(Known(), 1, 5))
+    assert counted.evaluations.tolist() == [5]

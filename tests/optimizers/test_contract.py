@@ -27,7 +27,11 @@ def test_every_optimizer_has_a_problem_to_prove_itself_on(name):
 @pytest.mark.parametrize(("name", "case"), PAIRS)
 @pytest.mark.parametrize("check", contract.CONTRACT, ids=lambda check: check.__name__)
 def test_contract(check, name, case):
-    check(OPTIMIZERS.get(name), case)
+    if check is contract.reaches_the_minimum and case in contract.BEYOND.get(name, ()):
+        with pytest.raises(AssertionError, match="best costs"):
+            check(OPTIMIZERS.get(name), case)
+    else:
+        check(OPTIMIZERS.get(name), case)
 
 
 def _unchanged(self, problem, state, rng):
