@@ -69,7 +69,7 @@ def _work() -> None:
 
 def _leave_with(parent: BaseProcess) -> None:
     parent.join()
-    os._exit(1)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 @contextmanager
