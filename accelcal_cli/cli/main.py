@@ -12,7 +12,7 @@ import typer.core
 
 from accelcal_cli import __version__
 from accelcal_cli.cli import benchmark, calibrate, optimizers, simulate
-from accelcal_cli.errors import AccelcalError
+from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -74,6 +74,8 @@ def main() -> None:
         _fail(str(error), BAD_INPUT)
     except BadUsage as error:
         _explain(error)
+    except Interrupted as error:
+        _fail(str(error), INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except BrokenPipeError:

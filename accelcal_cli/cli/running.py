@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.errors import AccelcalError, UsageError
+from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.engine import Executors, Journal
     from accelcal_cli.studies.engine import Progress as Report
     from accelcal_cli.studies.study import Record, Study
 
-INTERRUPTED = 130
 MOST_JOBS = 1024
 RAW_SUFFIXES = (".csv", ".parquet")
 PLOT_SUFFIXES = (".png", ".svg")
@@ -88,8 +87,7 @@ def run(
         if raw is not None:
             write_raw(raw_table(study, records), raw)
     except KeyboardInterrupt:
-        typer.echo(f"accelcal: interrupted{_kept(journal)}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        raise Interrupted(f"interrupted{_kept(journal)}") from None
     except AccelcalError as error:
         raise type(error)(f"{error}{_kept(journal)}") from None
     journal.remove()

@@ -184,7 +184,7 @@ def test_a_wrong_file_is_explained(tmp_path, text, message):
 
 
 def test_ranks_and_friedman_are_those_of_scipy():
-    medians = np.random.default_rng(5).random((9, 4)) + [0.0, 0.3, 0.6, 0.0]
+    medians = np.random.default_rng(5).random((9, 4)) + np.array([0.0, 0.3, 0.6, 0.0])
     result = ranks.ranking(["a", "b", "c", "d"], medians)
     order = ["abcd".index(label) for label in result.labels]
     assert result.ranks == pytest.approx(stats.rankdata(medians, axis=1).mean(axis=0)[order])
