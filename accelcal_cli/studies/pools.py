@@ -81,13 +81,14 @@ def cluster(address: str) -> Iterator[Executor]:
             version of accelcal, or the cluster is lost on the way.
     """
     try:
-        from distributed import Client
+        import distributed
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
     where = f"--cluster {address}"
+    connect: Any = distributed.Client
     try:
-        client: Any = Client(address, timeout=ANSWER_TIME, set_as_default=False)  # type: ignore[no-untyped-call]
+        client = connect(address, timeout=ANSWER_TIME, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DataError(f"{where}: no Dask scheduler answers there ({error})") from None
     with client:
