@@ -111,7 +111,7 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
 
 def _shipped_parameters(optimizer: Any) -> dict[str, Any]:
     files = shipped("optimizers")
-    if optimizer not in files:
+    if not isinstance(optimizer, str) or optimizer not in files:
         return {}
     parameters: dict[str, Any] = load_mapping(files[optimizer]).get("parameters") or {}
     return parameters

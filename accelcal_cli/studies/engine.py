@@ -179,8 +179,8 @@ def cluster(address: str) -> Iterator[Executor]:
     except ImportError:
         raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
     try:
-        client = Client(address, timeout="10s")
+        client = Client(address, timeout="10s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise DataError(f"--cluster {address}: no Dask scheduler answers there ({error})") from None
     with client:
-        yield client.get_executor(pure=False)
+        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
