@@ -26,7 +26,7 @@ def _distinct(u):
     [
         (poses.faces, 6, 6, 6),
         (poses.edges, 12, 12, 9),
-        (poses.corners, 8, 8, 6),
+        (poses.corners, 8, 8, 7),
         (poses.faces_edges, 12, 12, 9),
         (poses.icosahedron, 12, 12, 9),
         (poses.turns, 24, 18, 9),
@@ -142,7 +142,9 @@ def test_words_for_a_pose(direction, words):
 def _read(words):
     """The direction that the words of `describe` mean: what a person would hold."""
     axis = {
-        f"{sign}{name}": s * row for sign, s in (("+", 1), ("-", -1)) for name, row in zip("xyz", np.eye(3))
+        f"{sign}{name}": s * row
+        for sign, s in (("+", 1), ("-", -1))
+        for name, row in zip("xyz", np.eye(3), strict=True)
     }
     if words.startswith("corner"):
         return sum(axis[word.strip(",")] for word in words.split()[2:6] if word != "and") / np.sqrt(3)
