@@ -54,6 +54,11 @@ class Benchmark(Study):
         """Return function name and optimizer of a cell."""
         return self.functions[number // len(self.entries)], self.entries[number % len(self.entries)]
 
+    def names(self, cell: int) -> dict[str, str]:
+        """Return function and optimizer of a cell; see `Study.names`."""
+        function, entry = self.cell(cell)
+        return {"function": function, "optimizer": entry.label}
+
     def execute(self, task: Task) -> list[Record]:
         """Return the records of a task's runs."""
         name, entry = self.cell(task.cell)

@@ -18,6 +18,7 @@ import numpy as np
 from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer
 from accelcal_cli.optimizers.minimize import Run
 from accelcal_cli.streams import Float
+from accelcal_cli.table import Column, Table
 
 TRACE_POINTS = 200
 """Points of a record's convergence curve."""
@@ -100,8 +101,12 @@ class Study(ABC):
 
     @property
     def block(self) -> int:
-        """Runs of one task: the unit that is kept when a study is interrupted."""
-        return 20
+        """Runs of one task: the unit that is kept when a study is interrupted, and that a worker gets."""
+        return 5
+
+    @abstractmethod
+    def names(self, cell: int) -> dict[str, str]:
+        """Return what identifies a cell in the raw results, such as function and optimizer, by column."""
 
     @abstractmethod
     def execute(self, task: Task) -> list[Record]:
@@ -153,6 +158,34 @@ def records_of(
         )
         for i, number in enumerate(run.runs)
     ]
+
+
+def raw_table(study: Study, records: Sequence[Record]) -> Table:
+    """Return one row a run: everything that does not depend on how fast or where it ran.
+
+    Costs and values that are not finite are left for the writer to leave empty.
+    """
+    labels = list(study.names(0))
+    further = list(dict.fromkeys(name for record in records for name in record.values))
+    columns = [
+        *(Column(label) for label in labels),
+        Column("run", format="d"),
+        Column("cost", format=".6g"),
+        Column("evaluations", format="d"),
+        Column("iterations", format="d"),
+        Column("status"),
+        Column("hit", format="d"),
+        *(Column(name, format=".6g") for name in further),
+    ]
+    rows = [
+        (
+            *study.names(r.cell).values(),
+            *(r.run, r.cost, r.evaluations, r.iterations, r.status, r.hit),
+            *(r.values.get(name) for name in further),
+        )
+        for r in records
+    ]
+    return Table("Raw results", tuple(columns), tuple(rows))
 
 
 def _hit(run: Run, i: int, tolerance: float | None) -> int | None:
