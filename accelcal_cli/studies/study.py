@@ -20,8 +20,11 @@ from accelcal_cli.optimizers.minimize import Run
 from accelcal_cli.streams import Float
 from accelcal_cli.table import Column, Table
 
-TRACE_POINTS = 200
+TRACE_POINTS = 100
 """Points of a record's convergence curve."""
+
+CURVES = 100
+"""Runs of a cell that keep their curve, the first ones: the median of so many is smooth."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Record:
         cost: best cost; evaluations, iterations: used; status: how it ended.
         hit: evaluations when the cost first was at or below the tolerance, or None.
         values: further results of the kind of study (parameter errors, ...), by name.
-        curve: pairs (evaluations, best cost so far), thinned.
+        curve: pairs (evaluations, best cost so far), thinned; none beyond the first CURVES runs.
         seconds: wall time of the run: its share of its block's.
     """
 
@@ -197,7 +200,7 @@ def _hit(run: Run, i: int, limit: float) -> int | None:
 
 
 def _curve(run: Run, i: int) -> tuple[tuple[int, float], ...]:
-    if run.trace is None or run.trace_evaluations is None:
+    if run.trace is None or run.trace_evaluations is None or run.runs[i] >= CURVES:
         return ()
     last = int(run.iterations[i]) + 1
     keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, TRACE_POINTS))})
@@ -205,12 +208,15 @@ def _curve(run: Run, i: int) -> tuple[tuple[int, float], ...]:
     return tuple((int(n), float(c)) for n, c in zip(counts, costs, strict=True) if np.isfinite(c))
 
 
-def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float]:
-    """Return the median best cost of several runs against evaluations, both of shape (points,)."""
-    last = max(r.curve[-1][0] for r in records if r.curve)
-    grid = np.linspace(min(r.curve[0][0] for r in records if r.curve), last, points)
-    rows = []
-    for record in records:
-        counts, costs = np.array(record.curve).T
-        rows.append(costs[np.maximum(np.searchsorted(counts, grid, side="right") - 1, 0)])
+def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float] | None:
+    """Return the median best cost of several runs against evaluations, both of shape (points,).
+
+    From where all runs have a cost to the last evaluation of the longest; one that ended keeps its cost. None
+    when no run left a curve.
+    """
+    curves = [np.array(record.curve).T for record in records if record.curve]
+    if not curves:
+        return None
+    grid = np.linspace(max(n[0] for n, _ in curves), max(n[-1] for n, _ in curves), points)
+    rows = [cost[np.searchsorted(n, grid, side="right") - 1] for n, cost in curves]
     return grid, np.median(rows, axis=0)
