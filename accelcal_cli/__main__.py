@@ -1,8 +1,17 @@
 """Run accelcal as `python -m accelcal_cli`."""
 
-from accelcal_cli.cli.main import main
+import sys
 
-__all__ = ["main"]
+
+def main() -> None:
+    """Run the command line; an interrupt while it is still being imported is one line, too."""
+    try:
+        from accelcal_cli.cli.main import main as run
+    except KeyboardInterrupt:
+        sys.stderr.write("accelcal: interrupted\n")
+        sys.exit(130)
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -112,7 +112,7 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
 def shipped_parameters(optimizer: Any) -> dict[str, Any]:
     """Return the settings that the shipped file of an optimizer states; none for an unknown one."""
     files = shipped("optimizers")
-    if optimizer not in files:
+    if not isinstance(optimizer, str) or optimizer not in files:
         return {}
     parameters: dict[str, Any] = load_mapping(files[optimizer]).get("parameters") or {}
     return parameters

@@ -5,12 +5,17 @@ Shapes everywhere: R runs, P points of a population, D dimensions, M residuals.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.streams import Float, Int
+
+Bound = Float | float
+"""A limit of every coordinate: one number for all, or an array that broadcasts against (R, P, D)."""
 
 
 class Problem(ABC):
@@ -47,6 +52,13 @@ class Problem(ABC):
     def groups(self) -> Int:
         """Number of the group of alike unknowns that each coordinate belongs to, shape (D,)."""
         return np.zeros(self.dimensions, dtype=np.intp)
+
+    @cached_property
+    def limits(self) -> tuple[Bound, Bound]:
+        """Lower and upper, as two numbers where all coordinates have the same: numpy clips faster by numbers."""
+        if np.ptp(self.lower) == 0 and np.ptp(self.upper) == 0:
+            return float(self.lower[0]), float(self.upper[0])
+        return self.lower, self.upper
 
     @abstractmethod
     def cost(self, x: Float) -> Float:
@@ -89,15 +101,19 @@ class Counted(Problem):
         self.name, self.lower, self.upper = problem.name, problem.lower, problem.upper
         self.minimum = problem.minimum
         self.has_residuals, self.has_closed_form = problem.has_residuals, problem.has_closed_form
-        self.evaluations: NDArray[np.int64] = np.zeros(runs, dtype=np.int64)
+        self.runs, self.spent = runs, 0
         self.best_x: Float = np.full((runs, problem.dimensions), np.nan)
         self.best_cost: Float = np.full(runs, np.inf)
-        self._rows = np.arange(runs)
+
+    @property
+    def evaluations(self) -> NDArray[np.int64]:
+        """Evaluations of each run, shape (R,); all runs are always evaluated together."""
+        return np.full(self.runs, self.spent)
 
     def cost(self, x: Float) -> Float:
         """Return the cost with NaN as +inf; see `Problem.cost`."""
         fx = self.problem.cost(x)
-        if not np.isfinite(np.add.reduce(fx, axis=None)):
+        if math.isnan(np.minimum.reduce(fx, axis=None)):
             fx = np.where(np.isnan(fx), np.inf, fx)
         self._note(x, fx)
         return fx
@@ -111,7 +127,7 @@ class Counted(Problem):
 
     def jacobian(self, x: Float) -> Float:
         """Return the Jacobian, counted as one evaluation a point."""
-        self.evaluations += x.shape[1]
+        self.spent += x.shape[1]
         return self.problem.jacobian(x)
 
     @property
@@ -128,7 +144,7 @@ class Counted(Problem):
         """Return gradient and Hessian; analytic ones count as one evaluation a point, differences as they are."""
         if type(self.problem).gradient_hessian is Problem.gradient_hessian:
             return differences(self, x)
-        self.evaluations += x.shape[1]
+        self.spent += x.shape[1]
         return self.problem.gradient_hessian(x)
 
     def closed_form(self) -> Float:
@@ -138,28 +154,25 @@ class Counted(Problem):
     def take(self, index: Int) -> Counted:
         """Return the counted problem of the runs at `index`, with their counts and best points."""
         part = Counted(self.problem.take(index), len(index))
-        part.evaluations = self.evaluations[index]
+        part.spent = self.spent
         part.best_x, part.best_cost = self.best_x[index], self.best_cost[index]
         return part
 
     def _note(self, x: Float, fx: Float) -> None:
-        self.evaluations += x.shape[1]
-        column = fx.argmin(axis=1)
-        least = fx[self._rows, column]
-        better = least < self.best_cost
-        if better.any():
-            self.best_cost = np.where(better, least, self.best_cost)
-            self.best_x = np.where(better[:, None], x[self._rows, column], self.best_x)
+        self.spent += x.shape[1]
+        self.best_x, self.best_cost = improved(self.best_x, self.best_cost, x, fx)
 
 
 def differences(problem: Problem, x: Float) -> tuple[Float, Float]:
     """Return gradient and Hessian of a cost by central differences; see `Problem.gradient_hessian`.
 
-    The step is the fourth root of the rounding unit times the box, which balances truncation and rounding of a
+    The points stay in the box: next to a wall they are those of the nearest point that has room for them. The step
+    is the fourth root of the rounding unit times the box, which balances truncation and rounding of a
     second difference.
     """
     D = problem.dimensions
     h = np.finfo(float).eps ** 0.25 * 0.5 * (problem.upper - problem.lower)
+    x = np.clip(x, problem.lower + 2.0 * h, problem.upper - 2.0 * h)
     f0 = problem.cost(x)
     steps = np.diag(h)
     plus = np.stack([problem.cost(x + steps[i]) for i in range(D)], axis=-1)
@@ -175,3 +188,19 @@ def differences(problem: Problem, x: Float) -> tuple[Float, Float]:
             )
             hessian[..., i, j] = hessian[..., j, i] = mixed
     return gradient, hessian
+
+
+def improved(best_x: Float, best_cost: Float, x: Float, fx: Float) -> tuple[Float, Float]:
+    """Return the best points met so far, shape (R, D), and their costs, shape (R,), after x with cost fx.
+
+    New arrays where a run improved, else the old ones.
+    """
+    least = np.minimum.reduce(fx, axis=1)
+    better = least < best_cost
+    count = np.count_nonzero(better)
+    if not count:
+        return best_x, best_cost
+    found = x[np.arange(len(fx)), fx.argmin(axis=1)]
+    if count == len(fx):
+        return found, least
+    return np.where(better[:, None], found, best_x), np.minimum(least, best_cost)

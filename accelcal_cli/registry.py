@@ -34,17 +34,28 @@ def check(instance: Any, where: str = "") -> None:
     """Raise ConfigError when a field of a dataclass made with `setting` is outside its range."""
     for field in dataclasses.fields(instance):
         value, limits = getattr(instance, field.name), field.metadata
+        if isinstance(value, tuple) and not _all_finite(value):
+            raise ConfigError(f"{where}{field.name}: {list(value)} holds a number that is not finite")
         if isinstance(value, bool) or not isinstance(value, int | float):
             continue
         label = f"{where}{field.name}"
-        if not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{label}: {value} is not a finite number")
         if limits.get("low") is not None and value < limits["low"]:
             raise ConfigError(f"{label}: {value} is too small; expected at least {limits['low']:g}")
         if limits.get("above") is not None and value <= limits["above"]:
             raise ConfigError(f"{label}: {value} is too small; expected more than {limits['above']:g}")
         if limits.get("high") is not None and value > limits["high"]:
-            raise ConfigError(f"{label}: {value} is too large; expected at most {limits['high']:g}")
+            raise ConfigError(f"{label}: {_shown(value)} is too large; expected at most {limits['high']:g}")
+
+
+def _shown(value: float) -> str:
+    text = str(value)
+    return text if len(text) <= 30 else f"{text[:30]}..."
+
+
+def _all_finite(values: tuple[Any, ...]) -> bool:
+    return all(_all_finite(v) if isinstance(v, tuple) else math.isfinite(v) for v in values)
 
 
 def build(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
@@ -103,7 +114,7 @@ def convert(value: Any, hint: Any, label: str) -> Any:
 
 def _scalar(value: Any, hint: Any, label: str) -> Any:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int and number and float(value).is_integer():
+    if hint is int and number and (isinstance(value, int) or value.is_integer()):
         return int(value)
     if hint is float and number:
         return float(value)

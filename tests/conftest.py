@@ -1,16 +1,22 @@
-"""Fixtures shared by all tests."""
+"""Fixtures of the whole suite."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile("accelcal", deadline=None, max_examples=25, derandomize=True)
+hypothesis.settings.load_profile("accelcal")
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+"""Real recordings, kept beside the project and not part of it."""
 
 
 @pytest.fixture
 def shared_data() -> Path:
-    """Folder of real recordings beside the project; tests that need it skip where it is absent."""
-    folder = Path(__file__).resolve().parents[1].parent / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip("the real recordings are not on this machine")
-    return folder
+    """Folder of the real recordings; without it the test is skipped."""
+    if not SHARED.is_dir():
+        pytest.skip("the real recordings are not beside the project")
+    return SHARED

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
@@ -13,8 +14,8 @@ from accelcal_cli.calibration.planner import fixture_directions, next_poses
 from accelcal_cli.calibration.quality import Observability
 from accelcal_cli.calibration.residuals import Fit, examine, outliers
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
-from accelcal_cli.calibration.robust import robust_variance
-from accelcal_cli.calibration.search import Solution, lower_problem, model_at
+from accelcal_cli.calibration.robust import loss_weight, robust_variance
+from accelcal_cli.calibration.search import NO_NOISE, Solution, lower_problem, model_at
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import describe
@@ -50,7 +51,7 @@ def assemble(
     freedom = readings.poses - 9
     edge = _at_edge(solution)
     before, before_model = _before(start, settings)
-    fit = examine(readings, low, before_model, g, seen.cofactor, weights)
+    fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
     variance = _variance(readings, settings, solution, low, weights, freedom)
     covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
     sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
@@ -127,6 +128,14 @@ def _first_sight(
     said = quality.information(nine, point)[0]
     first = Observability.of(said, poses)
     return (said, first) if first.verdict == "undetermined" else (information, seen)
+
+
+def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:
+    """Return the weight that the robust fit gave a residual in m/s^2; None when all counted alike."""
+    noise = solution.noise
+    if noise is None or noise <= NO_NOISE * settings.g:
+        return None
+    return lambda e: loss_weight(e / noise, settings.robust)
 
 
 def _suggest(information: Float, seen: Observability) -> tuple[str, ...]:

@@ -22,6 +22,13 @@ from accelcal_cli.streams import Float, Int
 ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
 """Which K_ij each unknown is: diagonal, below it, above it (the last three in gauge `full` alone)."""
 
+AROUND = {
+    n + 1: np.array([positions.get((i % 3, j % 3), n) for i in range(5) for j in range(5)])
+    for n in (9, 12)
+    for positions in [{place: k for k, place in enumerate(ROWS_COLUMNS[: n - 3])}]
+}
+"""Which row of n unknowns and a zero each entry of the 5 x 5 table is that holds K going round, by n + 1."""
+
 
 def pack(K: Float, D: Float, unknowns: int) -> Float:
     """Return the unknowns, shape (..., 9 or 12), of K, shape (..., 3, 3), and D, shape (..., 3)."""
@@ -75,7 +82,7 @@ class Loetters(Problem):
         shift[:, -3:] = triangle.centre
         self._centre = (box.centre - shift) / (unit * triangle.scale[:, None])
         self._half = box.half / (unit * triangle.scale[:, None])
-        self._R, self._t = triangle.R[..., :10], triangle.R[..., 10:]
+        self._R, self._t = triangle.R[..., :10] * g**2, triangle.R[..., 10:] * g**2
 
     @property
     def units(self) -> Float:
@@ -87,12 +94,12 @@ class Loetters(Problem):
         r = self._R @ self._quadratic(x)
         r -= self._t
         r *= r
-        cost: Float = np.add.reduce(r, axis=1) * self.g**4
+        cost: Float = np.add.reduce(r, axis=1)
         return cost
 
     def residuals(self, x: Float) -> Float:
         """Return the 11 compressed residuals in (m/s^2)^2, shape (R, P, 11)."""
-        r: Float = (self._R @ self._quadratic(x) - self._t) * self.g**2
+        r: Float = self._R @ self._quadratic(x) - self._t
         return r.transpose(0, 2, 1)
 
     def jacobian(self, x: Float) -> Float:
@@ -111,7 +118,7 @@ class Loetters(Problem):
             change[..., 3] = -A[..., :, i]
             columns.append(_quadratic_change(M, change))
         q = np.stack(columns, axis=-1) * self._half[:, None, None]
-        jacobian: Float = (self._R[:, None] @ q) * self.g**2
+        jacobian: Float = self._R[:, None] @ q
         return jacobian
 
     @property
@@ -126,7 +133,7 @@ class Loetters(Problem):
         part is the Hessian of <Y, M^T M> with Y from R^T r. With dM = -A W, W = dK M + (0 | dd), it is
         2 <A W Y, A W> + 4 <M Y, A dK A W> as a quadratic form.
         """
-        J, r = self.jacobian(x) / self.g**2, self.residuals(x) / self.g**2
+        J, r = self.jacobian(x), self.residuals(x)
         K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
         A = np.linalg.inv(K)
         M = np.concatenate([A, -(A @ d[..., None])], axis=-1)
@@ -144,7 +151,7 @@ class Loetters(Problem):
         half = self._half[:, None, :]
         hessian = 2.0 * J.swapaxes(2, 3) @ J + 2.0 * second * half[..., :, None] * half[..., None, :]
         gradient = 2.0 * (J.swapaxes(2, 3) @ r[..., None])[..., 0]
-        return gradient * self.g**4, hessian * self.g**4
+        return gradient, hessian
 
     def closed_form(self) -> Float:
         """Return the ellipsoid fit in box coordinates, shape (R, D); NaN where the readings fix no ellipsoid."""
@@ -167,8 +174,13 @@ class Loetters(Problem):
 
     def _quadratic(self, x: Float) -> Float:
         """Return the ten entries of Q = M^T M, shape (R, 10, P), at x, shape (R, P, D)."""
-        theta = self._centre[:, :, None] + self._half[:, :, None] * x.transpose(0, 2, 1)
-        M = (_rows_lower if self.unknowns == 9 else _rows_full)(theta)
+        theta = np.zeros(
+            (len(x), self.unknowns + 1, x.shape[1])
+        )  # the last row, of zeros, is above the diagonal
+        unknowns = theta[:, :-1]
+        np.multiply(self._half[..., None], x.transpose(0, 2, 1), out=unknowns)
+        unknowns += self._centre[..., None]
+        M = _columns(theta)
         first, second = PAIRS
         products = M.take(first, axis=1)
         products *= M.take(second, axis=1)
@@ -195,36 +207,20 @@ def _symmetric(y: Float) -> Float:
     return Y
 
 
-def _rows_lower(theta: Float) -> Float:
-    """Return M^T, shape (R, 4, 3, P), for lower-triangular K by forward substitution."""
-    k21, k31, k32 = theta[:, 3], theta[:, 4], theta[:, 5]
-    d1, d2, d3 = theta[:, 6], theta[:, 7], theta[:, 8]
-    inverse = 1.0 / theta[:, :3]
-    a11, a22, a33 = inverse[:, 0], inverse[:, 1], inverse[:, 2]
-    M = np.zeros((len(theta), 4, 3, theta.shape[2]))
-    M[:, 0, 0], M[:, 1, 1], M[:, 2, 2] = a11, a22, a33
-    a21 = -k21 * a11 * a22
-    a32 = -k32 * a22 * a33
-    a31 = -(k31 * a11 + k32 * a21) * a33
-    M[:, 0, 1], M[:, 0, 2], M[:, 1, 2] = a21, a31, a32
-    M[:, 3, 0] = -a11 * d1
-    M[:, 3, 1] = -(a21 * d1 + a22 * d2)
-    M[:, 3, 2] = -(a31 * d1 + a32 * d2 + a33 * d3)
-    return M
+def _columns(theta: Float) -> Float:
+    """Return the columns of M = [A | -A d], shape (R, 4, 3, P), by cofactors: A_ji det K = C_ij.
 
-
-def _rows_full(theta: Float) -> Float:
-    """Return M^T, shape (R, 4, 3, P), for any K by the adjugate: A's columns are cross products of K's rows."""
-    k11, k22, k33, k21, k31, k32, k12, k13, k23 = (theta[:, i] for i in range(9))
-    rows = np.stack(
-        [np.stack(r, axis=1) for r in ((k11, k12, k13), (k21, k22, k23), (k31, k32, k33))], axis=1
-    )
-    M = np.empty((len(theta), 4, 3, theta.shape[2]))
-    A = M[:, :3].transpose(0, 2, 1, 3)  # A[:, i, j] is entry (i, j); M holds the transpose
-    for j in range(3):
-        u, v = rows[:, (j + 1) % 3], rows[:, (j + 2) % 3]
-        A[:, :, j] = u[:, [1, 2, 0]] * v[:, [2, 0, 1]] - u[:, [2, 0, 1]] * v[:, [1, 2, 0]]
-    determinant = np.add.reduce(rows[:, 0] * A[:, :, 0], axis=1)
-    M[:, :3] /= determinant[:, None, None]
-    M[:, 3] = -np.add.reduce(A * theta[:, None, 9:], axis=2)
+    C_ij = K_i+1,j+1 K_i+2,j+2 - K_i+1,j+2 K_i+2,j+1 with the indices of K going round: C is cut out of a 5 x 5
+    table that holds K going round.
+    """
+    runs, rows, population = theta.shape
+    K = theta.take(AROUND[rows], axis=1).reshape(runs, 5, 5, population)
+    M = np.empty((runs, 4, 3, population))
+    # M[:, j, i] is entry (i, j) of M, so that its first three columns, transposed, are the cofactors over det K.
+    A, shift = M[:, :3], M[:, 3]
+    np.multiply(K[:, 1:4, 1:4], K[:, 2:, 2:], out=A)
+    A -= K[:, 1:4, 2:] * K[:, 2:, 1:4]
+    A /= np.add.reduce(K[:, 0, :3] * A[:, 0], axis=1)[:, None, None]
+    np.add.reduce(A * theta[:, -4:-1, None], axis=1, out=shift)
+    np.negative(shift, out=shift)
     return M

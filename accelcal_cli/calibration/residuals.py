@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,6 +74,7 @@ def examine(
     g: float,
     cofactor: Float,
     weights: Float | None,
+    robust: Callable[[Float], Float] | None = None,
 ) -> Fit:
     """Return the fit of a model in gauge `lower`, pose by pose.
 
@@ -83,12 +84,15 @@ def examine(
         g: local gravity, m/s^2.
         cofactor: (J^T W J)^-1, shape (9, 9).
         weights: shape (J,) or None.
+        robust: the weight that a robust fit gave a weighted residual, m/s^2; None after least squares.
     """
     after_sum, before_sum, weighted_sum = 0.0, 0.0, 0.0
     parts: list[tuple[Int, Float, Float, Float]] = []
     uncalibrated = modulus_errors(readings, before, g)
     for (first, e, f), (_, e_before, _) in zip(modulus_errors(readings, model, g), uncalibrated, strict=True):
         w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
+        if robust is not None:
+            w = w * robust(np.sqrt(w) * e)
         after_sum += square_error(e, g)
         before_sum += square_error(e_before, g)
         scaled = np.sqrt(w) * e

@@ -201,8 +201,8 @@ def _infinite(value: float | None) -> float:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+    if isinstance(value, float):  # numpy's too, which YAML does not know
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, np.generic):
         return _plain(value.item())
     if isinstance(value, list | tuple):

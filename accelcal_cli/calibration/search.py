@@ -22,6 +22,9 @@ SAME_MINIMUM = 1e-6
 ROUNDING = 1e-26
 """A cost per reading, in units of g^4, below which only rounding is left."""
 
+NO_NOISE = 1e-12
+"""A robust standard deviation below this part of g is rounding: every weight is 1."""
+
 REWEIGHTINGS = 50
 """Robust rounds at most; they converge in about ten."""
 
@@ -83,7 +86,7 @@ def reweight(solution: Solution, readings: Readings, settings: Settings, weights
     for _ in range(REWEIGHTINGS):
         model = model_at(solution.problem, solution.x)
         noise = robust.noise_scale(readings, model, g)
-        if noise <= 1e-12 * g:  # noise-free readings: every weight is 1
+        if noise <= NO_NOISE * g:  # noise-free readings: every weight is 1
             return replace(solution, noise=noise)
         blocks = robust.robust_blocks(readings, model, g, noise, settings.robust, weights)
         problem = Loetters(compress(blocks, triangle.centre[0], triangle.scale[0]), g, solution.problem.box)

@@ -14,6 +14,9 @@ from accelcal_cli.sensor.units import STANDARD_GRAVITY
 Robust = Literal["none", "huber", "soft-l1"]
 Weights = Literal["none", "n", "sd"]
 
+LARGEST = 1e30
+"""Largest scale factor or bias of a nominal sensor, output units: its fourth power is still a number."""
+
 
 @dataclass(frozen=True)
 class BoxSettings:
@@ -39,6 +42,9 @@ class Nominal:
         """Refuse a nominal sensor without positive scale factors."""
         if self.scale is None or min(self.scale) <= 0:
             raise ConfigError("scale: expected three positive scale factors in output units per m/s^2")
+        check(self)
+        if not (min(self.scale) >= 1 / LARGEST and max(map(abs, (*self.scale, *self.bias))) <= LARGEST):
+            raise ConfigError(f"expected scale factors and biases of {1 / LARGEST:g} to {LARGEST:g}")
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,9 @@ class Settings:
 
     optimizer: str = setting("de-pso", "name of the optimizer")
     parameters: dict[str, Any] = field(default_factory=dict)
-    g: float = setting(STANDARD_GRAVITY, "local gravity, m/s^2; 1 for readings in units of g", above=0)
+    g: float = setting(
+        STANDARD_GRAVITY, "local gravity, m/s^2; 1 for readings in units of g", low=1e-3, high=1e6
+    )
     gauge: Gauge = setting("lower", "which of the equivalent matrices is shown")
     runs: int = setting(1, "independent searches (multi-start)", low=1, high=100_000)
     seed: int = setting(0, "seed of all random numbers", low=0)

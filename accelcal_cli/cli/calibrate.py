@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
 
 BAD_VERDICT = 1
+SUFFIXES = (".yaml", ".yml", ".json")
+"""Endings of a result file; they choose its form."""
 
 
 def command(
@@ -67,7 +70,9 @@ def command(
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
     options.check_format(format)
+    options.check_input(data)
     _check_output(output, format)
+    _check_tolerance(tolerance)
     stated_g = options.gravity(g, latitude, height)
     overrides: dict[str, Any] = {
         "optimizer": optimizer,
@@ -103,6 +108,11 @@ def _columns(text: str | None) -> list[str] | None:
     return None if text is None else [part.strip() for part in text.split(",")]
 
 
+def _check_tolerance(tolerance: float | None) -> None:
+    if tolerance is not None and not (math.isfinite(tolerance) and tolerance > 0):
+        raise UsageError(f"--tolerance {tolerance:g}: expected a positive number in m/s^2")
+
+
 def _check_output(output: str | None, format: str) -> None:
     if output is None:
         return
@@ -110,10 +120,10 @@ def _check_output(output: str | None, format: str) -> None:
         if format != "table":
             raise UsageError(f"-o - prints the result file; leave out --format {format}")
         return
-    if Path(output).suffix not in (".yaml", ".yml", ".json"):
-        raise UsageError(f'-o "{output}": expected a name that ends in .yaml, .yml or .json')
     from accelcal_cli.output.files import check_target
 
+    if Path(output).suffix not in SUFFIXES and not Path(output).is_dir():
+        raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
     check_target(output)
 
 

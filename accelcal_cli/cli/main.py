@@ -5,9 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.core
 
 from accelcal_cli import __version__
 from accelcal_cli.cli import calibrate, simulate
@@ -19,8 +20,24 @@ for library in ("OPENBLAS", "OMP", "MKL"):
     # Our matrices are small: threads only wait for each other, and a result must not depend on their number.
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+BadUsage: type[Exception] = typer.BadParameter.__bases__[0]
+"""What typer raises for an unknown command or option, or a value of the wrong type."""
+
+
+class Commands(typer.core.TyperGroup):
+    """The commands; keeps typer from taking a reader that left (`| head -1`) for a failure."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; leave quietly when the reader of its output has gone."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            _leave_pipe()
+
+
 app = typer.Typer(
     name="accelcal",
+    cls=Commands,
     help="Calibrate three-axis accelerometers without a turntable.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -48,12 +65,15 @@ def options(
 
 def main() -> None:
     """Run the command line; exit 0 done, 1 done with a bad verdict, 2 bad input, 130 interrupted."""
+    _open_streams()
     try:
-        app()
+        code = app(prog_name="accelcal", standalone_mode=False)
     except AccelcalError as error:
         _fail(str(error), BAD_INPUT)
-    except KeyboardInterrupt:
-        _fail("interrupted", INTERRUPTED)
+    except BadUsage as error:
+        _explain(error)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
     except BrokenPipeError:
         _leave_pipe()
     except OSError as error:
@@ -62,14 +82,35 @@ def main() -> None:
         _fail(f"cannot write: {(error.strerror or str(error)).lower()}", BAD_INPUT)
     except MemoryError:
         _fail("not enough memory for this input", BAD_INPUT)
+    if code == INTERRUPTED:
+        _fail("interrupted", INTERRUPTED)
+    sys.exit(code)
 
 
-def _fail(message: str, code: int) -> None:
+def _explain(error: Any) -> NoReturn:
+    """Print what is wrong with the command line in one line, or the help when nothing was asked for."""
+    if len(sys.argv) == 1:
+        typer.echo(error.format_message(), err=True)
+        sys.exit(BAD_INPUT)
+    command = error.ctx.command_path if error.ctx else "accelcal"
+    text = error.format_message().rstrip(".")
+    _fail(f"{text[:1].lower()}{text[1:]} (see {command} --help)", BAD_INPUT)
+
+
+def _open_streams() -> None:
+    """Put the null device where a stream was closed, as by `<&-`: Python has None there."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, open(null, mode, closefd=False))  # noqa: SIM115  # open as long as the program
+
+
+def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"accelcal: {message}", err=True)
     sys.exit(code)
 
 
-def _leave_pipe() -> None:
+def _leave_pipe() -> NoReturn:
     """Leave quietly when the reader of our output has gone, as `head` does."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(0)

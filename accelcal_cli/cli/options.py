@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 import typer
@@ -34,6 +35,12 @@ def check_format(choice: str) -> str:
             f'--format "{choice}": unknown{did_you_mean(choice, FORMATS)}; expected one of {", ".join(FORMATS)}'
         )
     return choice
+
+
+def check_input(source: str) -> None:
+    """Raise UsageError when readings are to come from a terminal, where nobody types them."""
+    if source == "-" and sys.stdin.isatty():
+        raise UsageError("-: standard input is a terminal; expected the name of a file, or a pipe")
 
 
 def gravity(g: float | None, latitude: float | None, height: float | None) -> float | None:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from accelcal_cli.streams import Float
 
 MOST_SAMPLES = 100_000_000
+LARGEST_NOISE = 100.0
+"""m/s^2, ten times gravity."""
 
 
 def command(
@@ -41,8 +43,6 @@ def command(
 
     With several samples a pose the rows carry the label of their pose, and `calibrate` averages them.
     """
-    import math
-
     from accelcal_cli.config import dump, load_sensor
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.sensor.poses import directions
@@ -50,10 +50,12 @@ def command(
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
     from accelcal_cli.streams import Streams
 
-    if noise is not None and not (math.isfinite(noise) and noise >= 0):
-        raise UsageError(f"--noise {noise:g}: expected zero or more, in m/s^2")
+    if noise is not None and not 0 <= noise <= LARGEST_NOISE:
+        raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
     if positions * samples > MOST_SAMPLES:
         raise UsageError(f"--positions {positions} with --samples {samples}: at most {MOST_SAMPLES:,} rows")
+    if output == truth:
+        raise UsageError(f'--truth "{truth}": expected another file than --output')
     for path in (output, truth):
         if path is not None:
             check_target(path)

@@ -12,7 +12,16 @@ from typing import Literal
 
 import numpy as np
 
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of, gather, partners
+from accelcal_cli.optimizers.base import (
+    OPTIMIZERS,
+    Optimizer,
+    State,
+    best_of,
+    better_of,
+    gather,
+    integers,
+    partners,
+)
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
@@ -56,17 +65,19 @@ class AdaptiveEvolution(Optimizer):
         take = (u[..., 3:] <= CR[..., None]) | (gene[..., None] == np.arange(dimensions))
         trial = np.where(take, mutant, x)  # [depf2015] eq. 5
         trial_cost = problem.cost(trial)
-        better = trial_cost < fx  # [depf2015] eq. 7
-        return State(np.where(better[..., None], trial, x), np.where(better, trial_cost, fx))
+        return State(*better_of(x, fx, trial, trial_cost))  # [depf2015] eq. 7
 
     def _mutants(self, x: Float, fx: Float, F: Float, u: Float) -> Float:
         """Return the mutants, [depf2015] eq. 3."""
         population = x.shape[1]
-        best = best_of(x, fx)[0]
-        chosen = gather(x, partners(u, population))
+        towards = best_of(x, fx)[:, None] - x
+        first, second = partners(integers(u, population - 1, population - 2))
         if self.difference == "best":
-            return x + F * (best - chosen[:, :population])
-        return x + F * (best - x) + F * (chosen[:, :population] - chosen[:, population:])
+            towards = towards + x - gather(x, first)
+        else:
+            towards += gather(x, first) - gather(x, second)
+        mutants: Float = x + F * towards
+        return mutants
 
 
 def _distance(cost: Float, fx: Float) -> Float:

@@ -15,8 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of
-from accelcal_cli.optimizers.pso import remember
+from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of, better_of
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
@@ -29,7 +28,7 @@ class KalmanState(State):
     velocity: Float  # filtered, (R, P, D)
     memory: Float  # p, (R, P, D)
     memory_cost: Float  # (R, P)
-    leader: Float  # g, (R, 1, D)
+    leader: Float  # g, (R, D)
     covariance: Float  # of (x, v, p, g) or (x, v), (R, k, k, P, D)
 
 
@@ -61,7 +60,7 @@ class AdaptiveKalmanSwarm(Optimizer):
         k = self.kalman_dim
         P = np.zeros((runs, k, k, dimensions, population)).swapaxes(-1, -2)
         P[:, range(k), range(k)] = self.noise
-        return KalmanState(x, fx, v, x, fx, best_of(x, fx)[0], P)
+        return KalmanState(x, fx, v, x, fx, best_of(x, fx), P)
 
     def step(self, problem: Problem, state: KalmanState, rng: Streams) -> KalmanState:
         """Predict with one set of random numbers, observe with another, filter."""
@@ -71,7 +70,7 @@ class AdaptiveKalmanSwarm(Optimizer):
         r1, r2, r1_fresh, r2_fresh = (u[..., k * dimensions : (k + 1) * dimensions] for k in range(4))
         phi1, phi2 = self.social * r1, self.cognitive * r2
         limit = self._limit(problem)
-        to_leader, to_memory = state.leader - x, state.memory - x
+        to_leader, to_memory = state.leader[:, None] - x, state.memory - x
         v_predicted = self.inertia * v + phi1 * to_leader + phi2 * to_memory  # eq. 16: X = Phi X
         x_predicted = x + v_predicted
         zv = self.inertia * v + self.social * r1_fresh * to_leader + self.cognitive * r2_fresh * to_memory
@@ -86,8 +85,8 @@ class AdaptiveKalmanSwarm(Optimizer):
         x = np.minimum(np.maximum(x, problem.lower), problem.upper)  # eq. 20
         v = np.minimum(np.maximum(v, -limit), limit)
         fx = problem.cost(x)
-        memory, memory_cost = remember(state.memory, state.memory_cost, x, fx)
-        return KalmanState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost)[0], P)
+        memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)
+        return KalmanState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost), P)
 
     def _predict(self, P: Float, phi1: Float, phi2: Float) -> Float:
         """Return e^alpha (Phi P Phi^T + Q), eq. 14 and 19, shape (R, k, k, P, D).

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.problem import Problem
+from accelcal_cli.problem import Bound, Problem
 from accelcal_cli.registry import Registry, check, setting
 from accelcal_cli.streams import Float, Int, Streams
 
@@ -81,42 +81,52 @@ OPTIMIZERS: Registry[Optimizer] = Registry("accelcal_cli.optimizers", "optimizer
 
 
 def gather(x: Float, index: Int) -> Float:
-    """Return rows of each run's population: x (R, P, D) at index (R, Q), shape (R, Q, D)."""
+    """Return points of each run's population counted round: x (R, P, D) at index (R, Q) modulo P, (R, Q, D)."""
     flat = x.transpose(0, 2, 1)
     out = np.empty((*flat.shape[:2], index.shape[1]))
-    for source, rows, target in zip(flat, index, out, strict=True):
-        # mode "clip" spares numpy a buffer; the indices are in range by construction.
-        source.take(rows, axis=1, out=target, mode="clip")
+    for source, columns, target in zip(flat, index, out, strict=True):
+        source.take(columns, axis=1, out=target, mode="wrap")
     return out.transpose(0, 2, 1)
 
 
-def at(fx: Float, column: Int) -> Float:
-    """Return one entry a run: fx (R, P) at column (R,), shape (R,)."""
-    return fx[np.arange(len(fx)), column]
+def press(x: Float, low: Bound, high: Bound) -> None:
+    """Press x, shape (R, P, D), between low and high, in place."""
+    if isinstance(low, float):
+        x.clip(low, high, out=x)
+    else:
+        np.maximum(x, low, out=x)
+        np.minimum(x, high, out=x)
 
 
-def best_of(x: Float, fx: Float) -> tuple[Float, Float]:
-    """Return each run's best point, shape (R, 1, D), and its cost, shape (R,)."""
-    column = fx.argmin(axis=1)
-    rows = np.arange(len(fx))
-    return x[rows, column][:, None, :], fx[rows, column]
+def better_of(x: Float, fx: Float, new: Float, new_cost: Float) -> tuple[Float, Float]:
+    """Return x and fx with every point replaced whose new one costs less; x, new (R, P, D), costs (R, P)."""
+    better = new_cost < fx
+    return np.where(better[..., None], new, x), np.minimum(new_cost, fx)
 
 
-def partners(u: Float, population: int) -> Int:
+def best_of(x: Float, fx: Float) -> Float:
+    """Return each run's best point, shape (R, D)."""
+    best: Float = x[np.arange(len(fx)), fx.argmin(axis=1)]
+    return best
+
+
+def integers(u: Float, *below: int) -> Int:
+    """Return integers, shape (R, C, P), from uniform numbers, shape (R, P, C); column c is in 0 .. below[c] - 1."""
+    whole: Int = (u.transpose(0, 2, 1) * np.array(below)[:, None]).astype(np.intp)
+    return whole
+
+
+def partners(picks: Int) -> tuple[Int, Int]:
     """Return two distinct partners, neither of them itself, for every individual.
 
     Args:
-        u: uniform numbers, shape (R, population, 2).
-        population: P >= 3.
+        picks: random integers below P - 1 and below P - 2, shape (R, 2, P), P >= 3; used up.
 
     Returns:
-        Indices, shape (R, 2 P): first the P first partners, then the P second ones. Drawn without rejection:
-        the first among the P - 1 others, the second among the P - 2 that remain.
+        Indices modulo P, twice (R, P). Drawn without rejection: the first is so many places further among
+        the P - 1 others, the second among the P - 2 that remain.
     """
-    own = np.arange(population)
-    first = (u[..., 0] * (population - 1)).astype(np.intp)
-    first += first >= own
-    second = (u[..., 1] * (population - 2)).astype(np.intp)
-    second += second >= np.minimum(first, own)
-    second += second >= np.maximum(first, own)
-    return np.concatenate((first, second), axis=1)
+    first, second = picks[:, 0], picks[:, 1]
+    second += second >= first
+    picks += np.arange(1, picks.shape[2] + 1)
+    return first, second

@@ -7,30 +7,39 @@ P_c is the share of parental genes; Storn and Price's CR is the share of mutant 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of, gather, partners
+from accelcal_cli.optimizers.base import (
+    OPTIMIZERS,
+    Optimizer,
+    State,
+    best_of,
+    better_of,
+    gather,
+    integers,
+    partners,
+    press,
+)
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Float, Int, Streams
 
 
-def keeps_parent(u: Float, share: float, forced: Float) -> NDArray[np.bool_]:
-    """Return where a trial keeps its parent's gene, [dpso2014] eq. 5.
+def mutates(u: Float, share: float, gene: Int) -> NDArray[np.bool_]:
+    """Return where a trial takes the mutant's gene, shape (R, P, D), [dpso2014] eq. 5.
 
     Args:
         u: uniform numbers, one a gene, shape (R, P, D).
         share: P_c, the probability to keep the parent's gene.
-        forced: uniform numbers, shape (R, P), that choose the gene J_rand always taken from the mutant.
+        gene: J_rand, the gene always taken from the mutant, shape (R, P).
     """
-    keep = u <= share
-    gene = (forced * u.shape[2]).astype(np.intp)
-    keep &= gene[..., None] != np.arange(u.shape[2])
-    return keep
+    taken = u > share
+    taken[np.arange(u.shape[0])[:, None], np.arange(u.shape[1]), gene] = True
+    return taken
 
 
 @OPTIMIZERS.register("de")
@@ -60,20 +69,24 @@ class DifferentialEvolution(Optimizer):
         x, fx = state.x, state.fx
         population, dimensions = x.shape[1:]
         u = rng.uniform(population, dimensions + 4)
-        chosen = gather(x, partners(u[..., :2], population))
-        mutant = chosen[:, :population] - chosen[:, population:]
-        mutant *= self.weight
-        mutant += self._base(x, fx, u[..., 2])  # [dpso2014] eq. 3 and 4
-        np.clip(mutant, problem.lower, problem.upper, out=mutant)
+        picks = integers(u[..., :4], population - 1, population - 2, population, dimensions)
         share = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover
-        np.copyto(mutant, x, where=keeps_parent(u[..., 4:], share, u[..., 3]))
-        trial_cost = problem.cost(mutant)
-        better = trial_cost < fx  # [dpso2014] eq. 6
-        return replace(state, x=np.where(better[..., None], mutant, x), fx=np.where(better, trial_cost, fx))
+        trial = self._change(x, fx, picks)
+        trial *= mutates(u[..., 4:], share, picks[:, 3])  # [dpso2014] eq. 5
+        trial += x
+        press(trial, *problem.limits)
+        return State(*better_of(x, fx, trial, problem.cost(trial)))  # [dpso2014] eq. 6
 
-    def _base(self, x: Float, fx: Float, u: Float) -> Float:
-        if self.strategy == "best/1":
-            return best_of(x, fx)[0]
-        if self.strategy == "current/1":
-            return x
-        return gather(x, (u * x.shape[1]).astype(np.intp))
+    def _change(self, x: Float, fx: Float, picks: Int) -> Float:
+        """Return what mutation adds to x, [dpso2014] eq. 3 and 4: (base - x) + F (x_n - x_m)."""
+        n, m = partners(picks[:, :2])
+        change = gather(x, n)
+        change -= gather(x, m)
+        change *= self.weight
+        if self.strategy == "rand/1":
+            change += gather(x, picks[:, 2])
+            change -= x
+        elif self.strategy == "best/1":
+            change += best_of(x, fx)[:, None]
+            change -= x
+        return change

@@ -12,9 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of, gather, partners
-from accelcal_cli.optimizers.de import keeps_parent
-from accelcal_cli.optimizers.pso import remember, velocity
+from accelcal_cli.optimizers.base import (
+    OPTIMIZERS,
+    Optimizer,
+    State,
+    best_of,
+    better_of,
+    gather,
+    integers,
+    partners,
+    press,
+)
+from accelcal_cli.optimizers.de import mutates
+from accelcal_cli.optimizers.pso import velocity
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
@@ -22,12 +32,12 @@ from accelcal_cli.streams import Float, Streams
 
 @dataclass(frozen=True)
 class HybridState(State):
-    """Both halves: x and fx hold the swarm's positions first, then the evolving individuals."""
+    """Both halves, the swarm first: x and fx are the points of the last evaluation, positions and trials."""
 
     velocity: Float  # (R, P/2, D)
-    memory: Float  # pbest, (R, P/2, D)
-    memory_cost: Float  # (R, P/2)
-    leader: Float  # common best, (R, 1, D)
+    memory: Float  # pbest, then the evolving individuals: what only a better point replaces, (R, P, D)
+    memory_cost: Float  # (R, P)
+    leader: Float  # common best, (R, D)
     iteration: int
 
 
@@ -60,59 +70,51 @@ class HybridSwarm(Optimizer):
         x[:, :half, 0] = 0.5 * (x[:, :half, 0] + lower)
         x[:, half:, 0] = 0.5 * (x[:, half:, 0] + upper)
         fx = problem.cost(x)
-        return HybridState(
-            x, fx, np.zeros_like(x[:, :half]), x[:, :half], fx[:, :half], best_of(x, fx)[0], iteration=0
-        )
+        return HybridState(x, fx, np.zeros_like(x[:, :half]), x, fx, best_of(x, fx), iteration=0)
 
     def step(self, problem: Problem, state: HybridState, rng: Streams) -> HybridState:
         """Move both halves once; one call evaluates them together."""
-        population, dimensions = state.x.shape[1:]
-        half = population // 2
-        u = rng.uniform(population - half, 3 * dimensions + 3)
-        falling = self._curve(state.iteration)
-        v = velocity(
-            state.x[:, :half],
-            state.velocity,
-            state.memory,
-            state.leader,
-            u[:, :half, : 2 * dimensions],
-            self.inertia_max - (self.inertia_max - self.inertia_min) * falling,  # [dpso2014] eq. 7
-            self.social,
-            self.cognitive,
-        )
-        limit = 0.5 * self.speed * (problem.upper - problem.lower)
-        np.clip(v, -limit, limit, out=v)
-        trial = np.empty_like(state.x)
-        np.add(state.x[:, :half], v, out=trial[:, :half])  # [dpso2014] eq. 2
-        own = self.own_max - (self.own_max - self.own_min) * falling  # [dpso2014] eq. 9
-        trial[:, half:] = self._mutants(state.x[:, half:], state.leader, own, u[..., 2 * dimensions :])
-        np.clip(trial, problem.lower, problem.upper, out=trial)
-        fx = problem.cost(trial)
-        return self._select(state, trial, fx, v)
+        x, half = np.empty_like(state.x), state.velocity.shape[1]
+        u = rng.uniform(x.shape[1] - half, 3 * x.shape[2] + 3)
+        low, high = problem.limits
+        limit = 0.5 * self.speed * (high - low)
+        curve = self._curve(state.iteration)
+        v = self._velocity(state, u, curve)
+        press(v, -limit, limit)
+        np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
+        individuals = state.memory[:, half:].copy(order="K")
+        np.add(individuals, self._change(individuals, state.leader, u, curve), out=x[:, half:])
+        press(x, low, high)
+        fx = problem.cost(x)
+        memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
+        leader = best_of(memory, memory_cost)
+        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1)
 
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
         return float(1.0 / (1.0 + self.curve_a * self.curve_b ** (100.0 * iteration / self.iterations)))
 
-    def _mutants(self, x: Float, leader: Float, own: float, u: Float) -> Float:
-        """Return the trials of the evolving half: mutation and crossover."""
-        population, dimensions = x.shape[1:]
-        chosen = gather(x, partners(u[..., :2], population))
-        mutant = chosen[:, :population] - chosen[:, population:]
-        mutant *= self.weight
-        mutant += own * x
-        mutant += (1.0 - own) * leader  # [dpso2014] eq. 8
-        np.copyto(mutant, x, where=keeps_parent(u[..., 3:], self.crossover, u[..., 2]))  # [dpso2014] eq. 5
-        return mutant
+    def _velocity(self, state: HybridState, u: Float, curve: float) -> Float:
+        """Return the swarm's velocities before their limit."""
+        half, dimensions = state.velocity.shape[1:]
+        inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
+        x, memory, r = state.x[:, :half], state.memory[:, :half], u[:, :half, : 2 * dimensions]
+        return velocity(x, state.velocity, memory, state.leader, r, inertia, self.social, self.cognitive)
 
-    def _select(self, state: HybridState, trial: Float, fx: Float, v: Float) -> HybridState:
-        """Keep every swarm position, and a trial only where it is better than its parent."""
-        half = v.shape[1]
-        memory, memory_cost = remember(state.memory, state.memory_cost, trial[:, :half], fx[:, :half])
-        worse = fx[:, half:] >= state.fx[:, half:]  # [dpso2014] eq. 6
-        np.copyto(trial[:, half:], state.x[:, half:], where=worse[..., None])
-        fx = np.concatenate((fx[:, :half], np.where(worse, state.fx[:, half:], fx[:, half:])), axis=1)
-        swarm_best, swarm_cost = best_of(memory, memory_cost)
-        evolved_best, evolved_cost = best_of(trial[:, half:], fx[:, half:])
-        leader = np.where((swarm_cost < evolved_cost)[:, None, None], swarm_best, evolved_best)
-        return HybridState(trial, fx, v, memory, memory_cost, leader, iteration=state.iteration + 1)
+    def _change(self, x: Float, leader: Float, u: Float, curve: float) -> Float:
+        """Return what mutation and crossover add to the evolving half.
+
+        The paper's beta x + (1 - beta) leader is x + (1 - beta) (leader - x).
+        """
+        population, dimensions = x.shape[1:]
+        own = self.own_max - (self.own_max - self.own_min) * curve  # [dpso2014] eq. 9
+        picks = integers(u[..., -3:], population - 1, population - 2, dimensions)
+        n, m = partners(picks[:, :2])
+        change = gather(x, n)
+        change -= gather(x, m)
+        change *= self.weight
+        pull = leader[:, None] - x
+        pull *= 1.0 - own
+        change += pull  # [dpso2014] eq. 8
+        change *= mutates(u[..., 2 * dimensions : -3], self.crossover, picks[:, 2])  # [dpso2014] eq. 5
+        return change

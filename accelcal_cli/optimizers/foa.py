@@ -55,7 +55,7 @@ class FruitFly(Optimizer):
         fx = problem.cost(candidates)  # step 4
         smell = fx.min(axis=1)  # step 5
         better = smell < state.smell  # step 6
-        axis = np.where(better[:, None, None], best_of(flies, fx)[0], state.axis)
+        axis = np.where(better[:, None, None], best_of(flies, fx)[:, None], state.axis)
         return PlaneState(candidates, fx, axis, np.where(better, smell, state.smell))
 
     def _candidates(self, problem: Problem, flies: Float, population: int) -> Float:

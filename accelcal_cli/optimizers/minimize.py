@@ -7,8 +7,9 @@ trace, stopping, and the status of each run. A numerical failure is the status o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,9 @@ from accelcal_cli.optimizers.base import CONVERGED, FAILED, Optimizer, take
 from accelcal_cli.problem import Counted, Problem
 from accelcal_cli.streams import Float, Int, Streams
 
-BLOCK_BYTES = 48 * 1024
-"""Runs go through the loop in blocks whose population fits this many bytes: a dozen temporaries of that size
-stay in the processor's second-level cache, which makes twenty runs of 100 x 12 about twice as fast."""
+BLOCK_BYTES = 192 * 1024
+"""Runs go through the loop in blocks whose population fits this many bytes, twenty runs of 100 x 12: enough to
+hide the interpreter, and a handful of temporaries of that size still fits the second-level cache."""
 
 
 class Status(Enum):
@@ -96,6 +97,9 @@ def minimize(
     """
     numbers = np.arange(runs) if isinstance(runs, int) else np.asarray(runs, dtype=np.int64)
     size = max(1, BLOCK_BYTES // (8 * optimizer.population * problem.dimensions))
+    np.empty(
+        1 << 20
+    )  # Freed at once: from now on glibc keeps smaller blocks instead of faulting them in anew.
     parts = []
     for first in range(0, len(numbers), size):
         block = np.arange(first, min(first + size, len(numbers)))
@@ -116,74 +120,83 @@ class _Loop:
 
     def run(self, numbers: NDArray[np.int64], seed: int, x: Float | None) -> Run:
         runs = len(numbers)
-        rng = Streams(seed, numbers.tolist())
-        counted = Counted(self.problem, runs)
+        self.alive: Int = np.arange(runs)
+        self.rng, self.counted = Streams(seed, numbers.tolist()), Counted(self.problem, runs)
+        self.status = [Status.ITERATIONS] * runs
+        self.best_x, self.best_cost = np.empty((runs, self.problem.dimensions)), np.empty(runs)
+        self.steps, self.evaluations = np.zeros(runs, np.int64), np.zeros(runs, np.int64)
+        self.costs: list[tuple[Int, Float]] = []
+        self.counts: list[int] = []
         if x is None:
             lower, upper = self.problem.start or (self.problem.lower, self.problem.upper)
-            x = lower + (upper - lower) * rng.uniform(self.optimizer.population, lower.size)
-        state = self.optimizer.init(counted, x, rng)
-        alive: Int = np.arange(runs)
-        self.status = [Status.ITERATIONS] * runs
-        self.steps = np.zeros(runs, dtype=np.int64)
-        self.best_x, self.best_cost = counted.best_x.copy(), counted.best_cost.copy()
-        self.evaluations = counted.evaluations.copy()
-        costs, counts = [self.best_cost.copy()], [self.evaluations.copy()]
+            x = lower + (upper - lower) * self.rng.uniform(self.optimizer.population, lower.size)
+        state = self._noted(self.optimizer.init(self.counted, x, self.rng))
         for k in range(self.optimizer.iterations):
-            ended = self._ended(counted, state, alive)
-            if ended.any():
-                keep = np.flatnonzero(~ended)
-                alive, counted, state, rng = (
-                    alive[keep],
-                    counted.take(keep),
-                    take(state, keep),
-                    rng.take(keep),
-                )
-                if not len(alive):
-                    break
-            state = self.optimizer.step(counted, state, rng)
-            self.steps[alive] = k + 1
-            self.best_cost[alive], self.evaluations[alive] = counted.best_cost, counted.evaluations
-            self.best_x[alive] = counted.best_x
-            if self.trace:
-                costs.append(self.best_cost.copy())
-                counts.append(self.evaluations.copy())
+            state = self._retired(state, k)
+            if not len(self.alive):
+                break
+            state = self._noted(self.optimizer.step(self.counted, state, self.rng))
         else:
-            self._ended(counted, state, alive)
-        return self._outcome(numbers, costs, counts)
+            self._retired(state, self.optimizer.iterations)
+            self._leave(np.arange(len(self.alive)), self.optimizer.iterations)
+        return self._outcome(numbers)
 
-    def _ended(self, counted: Counted, state: object, alive: Int) -> NDArray[np.bool_]:
-        """Return which of the runs still alive have ended, and note how."""
-        ended = np.zeros(len(alive), dtype=bool)
-        status = getattr(state, "status", None)
-        checks: list[tuple[Status, NDArray[np.bool_]]] = []
-        if self.stopping.evaluations is not None:
-            checks.append((Status.EVALUATIONS, counted.evaluations >= self.stopping.evaluations))
-        if status is not None:
-            checks.append((Status.FAILED, status == FAILED))
-            checks.append((Status.CONVERGED, status == CONVERGED))
-        if self.stopping.tolerance is not None:
-            checks.append((Status.TOLERANCE, counted.best_cost <= self.stopping.tolerance))
-        for name, which in checks:
+    def _noted(self, state: Any) -> Any:
+        """Return the state, its best costs entered in the trace."""
+        if self.trace:
+            # Counted replaces this array when a run improves and never writes into it: no copy is needed.
+            self.costs.append((self.alive, self.counted.best_cost))
+            self.counts.append(self.counted.spent)
+        return state
+
+    def _retired(self, state: Any, k: int) -> Any:
+        """Return the state without the runs that have ended after k steps."""
+        checks = self._checks(state)
+        if not any(which.any() for _, which in checks):
+            return state
+        for status, which in checks:
             for i in np.flatnonzero(which):
-                self.status[alive[i]] = name
-            ended |= which
-        return ended
+                self.status[self.alive[i]] = status
+        ended = np.logical_or.reduce([which for _, which in checks])
+        self._leave(np.flatnonzero(ended), k)
+        keep = np.flatnonzero(~ended)
+        self.alive, self.counted, self.rng = self.alive[keep], self.counted.take(keep), self.rng.take(keep)
+        return take(state, keep)
 
-    def _outcome(
-        self, numbers: NDArray[np.int64], costs: list[Float], counts: list[NDArray[np.int64]]
-    ) -> Run:
+    def _checks(self, state: Any) -> list[tuple[Status, NDArray[np.bool_]]]:
+        """Return each reason to end and the runs it holds for, the weightiest reason last."""
+        checks = []
+        if self.stopping.evaluations is not None:
+            checks.append((Status.EVALUATIONS, self.counted.evaluations >= self.stopping.evaluations))
+        if state.status is not None:
+            checks.append((Status.FAILED, state.status == FAILED))
+            checks.append((Status.CONVERGED, state.status == CONVERGED))
+        if self.stopping.tolerance is not None:
+            checks.append((Status.TOLERANCE, self.counted.best_cost <= self.stopping.tolerance))
+        return checks
+
+    def _leave(self, index: Int, k: int) -> None:
+        """Enter the results of the runs at `index` of those alive, which have made k steps."""
+        runs, counted = self.alive[index], self.counted
+        self.best_x[runs], self.best_cost[runs] = counted.best_x[index], counted.best_cost[index]
+        self.steps[runs], self.evaluations[runs] = k, counted.spent
+
+    def _outcome(self, numbers: NDArray[np.int64]) -> Run:
         status = tuple(
             s if np.isfinite(c) else Status.FAILED for s, c in zip(self.status, self.best_cost, strict=True)
         )
-        return Run(
-            numbers,
-            self.best_x,
-            self.best_cost,
-            self.evaluations,
-            self.steps,
-            status,
-            np.array(costs).T if self.trace else None,
-            np.array(counts).T if self.trace else None,
+        run = Run(numbers, self.best_x, self.best_cost, self.evaluations, self.steps, status)
+        if not self.trace:
+            return run
+        costs = np.empty((len(self.costs), len(numbers)))
+        for row, (alive, best) in zip(costs, self.costs, strict=True):
+            row[alive] = best
+        # A run that ended early keeps its last value.
+        last = np.minimum(np.arange(len(costs)), self.steps[:, None])
+        return replace(
+            run,
+            trace=np.take_along_axis(costs.T, last, axis=1),
+            trace_evaluations=np.array(self.counts)[last],
         )
 
 

@@ -1,7 +1,8 @@
 """Newton's iteration with the full Hessian, undamped: the baseline of the IFOA paper [ifoa2021, skog2006].
 
 theta <- theta - H^-1 grad L. Far from the minimum the Hessian may be singular or indefinite and the iteration
-diverges: such a run ends as a counted failure. Levenberg-Marquardt is the same idea with the damping that it lacks.
+diverges: such a run ends as a counted failure. A step that leaves the box ends at its wall. Levenberg-Marquardt is
+the same idea with the damping that it lacks.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Newton(Optimizer):
         usable &= values.min(axis=2) > SINGULAR * values.max(axis=2)
         hessian = np.where(usable[..., None, None], hessian, np.eye(state.x.shape[2]))
         step = np.linalg.solve(hessian, np.where(usable[..., None], gradient, 0.0)[..., None])[..., 0]
-        x = state.x - step
+        x = np.clip(state.x - step, problem.lower, problem.upper)
         fx = problem.cost(x)
         small = np.abs(step).max(axis=2) <= self.step_tolerance * (problem.upper - problem.lower).max()
         lost = ~usable | ~np.isfinite(fx)

@@ -7,11 +7,11 @@ is beyond the order-2 stability bound c1 + c2 < 24 (1 - w^2) / (7 - 5 w) = 3.35 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of
+from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of, better_of, press
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
@@ -24,7 +24,7 @@ class SwarmState(State):
     velocity: Float  # (R, P, D)
     memory: Float  # pbest, (R, P, D)
     memory_cost: Float  # (R, P)
-    leader: Float  # gbest, (R, 1, D)
+    leader: Float  # gbest, (R, D)
 
 
 def velocity(
@@ -32,25 +32,19 @@ def velocity(
 ) -> Float:
     """Return the new velocity, [dpso2014] eq. 1, where c1 goes with the global best.
 
-    All of shape (R, P, D), leader (R, 1, D), r uniform of shape (R, P, 2 D).
+    All of shape (R, P, D), leader (R, D), r uniform of shape (R, P, 2 D).
     """
     dimensions = x.shape[2]
-    pull = leader - x
+    pull = leader[:, None] - x
     pull *= r[..., :dimensions]
     pull *= c1
     own = memory - x
     own *= r[..., dimensions:]
     own *= c2
     pull += own
-    own = inertia * v
+    np.multiply(v, inertia, out=own)
     own += pull
     return own
-
-
-def remember(memory: Float, memory_cost: Float, x: Float, fx: Float) -> tuple[Float, Float]:
-    """Return the personal bests after the swarm has been at x with cost fx."""
-    better = fx < memory_cost
-    return np.where(better[..., None], x, memory), np.where(better, fx, memory_cost)
 
 
 @OPTIMIZERS.register("pso")
@@ -69,7 +63,7 @@ class ParticleSwarm(Optimizer):
     def init(self, problem: Problem, x: Float, rng: Streams) -> SwarmState:
         """Start at rest: v = 0."""
         fx = problem.cost(x)
-        return SwarmState(x, fx, np.zeros_like(x), x, fx, best_of(x, fx)[0])
+        return SwarmState(x, fx, np.zeros_like(x), x, fx, best_of(x, fx))
 
     def step(self, problem: Problem, state: SwarmState, rng: Streams) -> SwarmState:
         """Move the swarm once."""
@@ -78,11 +72,11 @@ class ParticleSwarm(Optimizer):
         v = velocity(
             x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive
         )
-        limit = 0.5 * self.speed * (problem.upper - problem.lower)
-        np.clip(v, -limit, limit, out=v)
+        low, high = problem.limits
+        limit = 0.5 * self.speed * (high - low)
+        press(v, -limit, limit)
         x = x + v  # [dpso2014] eq. 2
-        np.clip(x, problem.lower, problem.upper, out=x)
+        press(x, low, high)
         fx = problem.cost(x)
-        memory, memory_cost = remember(state.memory, state.memory_cost, x, fx)
-        leader = best_of(memory, memory_cost)[0]
-        return replace(state, x=x, fx=fx, velocity=v, memory=memory, memory_cost=memory_cost, leader=leader)
+        memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)
+        return SwarmState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost))

@@ -20,11 +20,19 @@ PIPE_WIDTH = 160
 VERDICT_STYLE = {"good": "bold green", "weak": "bold yellow", "undetermined": "bold red"}
 
 
+class _Console(Console):
+    """A console that leaves a broken pipe to the command line; rich itself would exit with 1."""
+
+    def on_broken_pipe(self) -> None:
+        """Pass the BrokenPipeError on."""
+        raise
+
+
 def console(file: IO[str] | None = None) -> Console:
     """Return a console for `file` (standard output when None); NO_COLOR and COLUMNS are respected."""
     target = file or sys.stdout
     width = None if target.isatty() or "COLUMNS" in os.environ else PIPE_WIDTH
-    return Console(file=target, width=width, highlight=False, emoji=False, markup=False)
+    return _Console(file=target, width=width, highlight=False, emoji=False, markup=False)
 
 
 def show(tables: Iterable[Table], out: Console) -> None:

@@ -55,6 +55,10 @@ class LineMap:
         k = bisect.bisect_right(self.rows, row) - 1
         return self.lines[k] + row - self.rows[k]
 
+    def where(self, row: int) -> str:
+        """How to name a row: ``line 8``."""
+        return f"line {self.line(row)}"
+
 
 class CarefulParser:
     """Parses text blocks row by row, and keeps count of rows and lines across blocks."""

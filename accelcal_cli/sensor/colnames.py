@@ -72,12 +72,8 @@ def recognise(names: Sequence[str]) -> Roles:
         elif found := _axis(key, _OUTPUT):
             _put(output, found, column)
     roles.families = {_title(names, triple): triple for triple in _triples(output).values()}
-    roles.doubtful = [
-        names[column]
-        for (_, turn), by in output.items()
-        if turn and len(by) < len(AXES)
-        for column in by.values()
-    ]
+    again = [by for (_, turn), by in output.items() if turn and len(by) < len(AXES)]
+    roles.doubtful = [names[column] for by in again for column in by.values()]
     for (family, _), triple in _triples(spread).items():
         roles.scatter.setdefault(family, triple)
     roles.reference = next(iter(_triples(reference).values()), None)

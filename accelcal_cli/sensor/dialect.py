@@ -42,7 +42,10 @@ def split_cells(line: str, separator: str) -> list[str]:
         return line.split() if separator == " " else [cell.strip() for cell in line.split(separator)]
     if separator == " ":
         line = " ".join(line.split())
-    row = next(csv.reader([line.strip()], delimiter=separator, skipinitialspace=True))
+    try:
+        row = next(csv.reader([line.strip(" \r\n")], delimiter=separator, skipinitialspace=True))
+    except csv.Error:  # a carriage return or an endless cell: then the quotes are no quotes either
+        row = line.split(separator)
     return [cell.strip() for cell in row]
 
 
@@ -119,9 +122,9 @@ def _separator(lines: list[str]) -> str:
     bare = [_QUOTED.sub("0", line.strip("\r\n")) for line in lines[:64]]
     best, share = " ", -1.0
     for separator in (";", "\t", ",", " "):
-        if 2 * sum(separator in line.strip() for line in bare) <= len(bare):
-            continue
         rows = [split_cells(line, separator) for line in bare]
+        if 2 * sum(len(row) > 1 for row in rows) <= len(bare):
+            continue
         numeric = _numeric_share(rows, decimal_comma=separator != ",")
         # aligned columns: tabs in runs, which would else be empty cells
         aligned = separator == " " and best == "\t" and numeric == share and _uneven("\t", " ", bare)

@@ -47,7 +47,7 @@ class FastParser:
     def _plain(self, block: bytes) -> bytes | None:
         """The block with one-byte separators only, or None if it needs care."""
         dialect = self.careful.dialect
-        if b'"' in block or b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+        if b"#" in block or b"\0" in block or not block.endswith(b"\n"):
             return None
         if self.careful.selection.text in self.careful.selection.numbers:
             return None
@@ -57,13 +57,16 @@ class FastParser:
             return None
         if b"\r" in block:
             block = block.replace(b"\r\n", b"\n")
-        block = _squeeze(block, dialect.separator.encode())
-        return None if b"\r" in block or _has_outer_blank_line(block) else block
+        squeezed = _squeeze(block, dialect.separator)
+        if b'"' in block and (dialect.separator == " " or squeezed != block):
+            return None  # blanks within quotes belong to the cell
+        return None if b"\r" in squeezed or _has_outer_blank_line(squeezed) else squeezed
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
 
         dialect, selection = self.careful.dialect, self.careful.selection
+        quoted = b'"' in block
         schema = {str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)}
         try:
             frame = pl.read_csv(
@@ -71,15 +74,16 @@ class FastParser:
                 has_header=False,
                 schema=schema,
                 separator=dialect.separator,
-                quote_char=None,
+                quote_char='"' if quoted else None,
                 decimal_comma=dialect.decimal_comma,
             )
         except pl.exceptions.PolarsError:
             return None
-        if dialect.width - 1 not in selection.numbers:  # a short row then shows only in the count
-            separators = np.count_nonzero(np.frombuffer(block, np.uint8) == ord(dialect.separator))
-            if separators != (dialect.width - 1) * len(frame):
-                return None
+        if quoted and _count(block, "\n") != len(frame):
+            return None  # a cell goes on over the end of its line
+        if frame[str(dialect.width - 1)].null_count():  # an empty last cell, or a row that is short
+            short = quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
+            return None if short else frame
         return frame
 
     def _numbers(self, frame: pl.DataFrame) -> NDArray[np.float64] | None:
@@ -107,6 +111,10 @@ def _has_outer_blank_line(block: bytes) -> bool:
     return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
 
 
+def _count(block: bytes, character: str) -> int:
+    return int(np.count_nonzero(np.frombuffer(block, np.uint8) == ord(character)))
+
+
 def _is_utf8(block: bytes) -> bool:
     try:
         block.decode()
@@ -115,18 +123,23 @@ def _is_utf8(block: bytes) -> bool:
     return True
 
 
-def _squeeze(block: bytes, separator: bytes) -> bytes:
-    """Drop the blanks around cells; for a white-space table leave one blank between them."""
-    blanks = (b" ",) if separator == b"\t" else (b" ", b"\t")
-    if not any(blank in block for blank in blanks):
-        return block
-    if separator == b" ":
+def _squeeze(block: bytes, separator: str) -> bytes:
+    """Drop the blanks around cells; of a run of blanks that is itself the separator leave one."""
+    if separator == " ":
         block = block.replace(b"\t", b" ")
-        for run in (b"        ", b"   ", b"  ", b"  "):
-            block = block.replace(run, b" ")
-    for blank in blanks:
-        for edge in (b"\n", separator):
-            for pair in (edge + blank, blank + edge) if edge != blank else ():
-                while pair in block:
-                    block = block.replace(pair, edge)
-    return block.removeprefix(b" ")
+    elif b" " not in block and (separator == "\t" or b"\t" not in block):
+        return block
+    text = np.frombuffer(block, np.uint8)
+    while True:
+        blank = text == ord(" ")
+        edge = text == ord("\n")
+        if separator != " ":
+            edge |= text == ord(separator)
+        if separator not in " \t":
+            blank |= text == ord("\t")
+        drop = blank.copy()
+        drop[1:] &= edge[:-1] | blank[:-1] if separator == " " else edge[:-1]
+        drop[:-1] |= blank[:-1] & edge[1:]
+        if not drop.any():
+            return text.tobytes()
+        text = text[~drop]

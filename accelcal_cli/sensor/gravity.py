@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 from accelcal_cli.errors import UsageError
+
+SMALLEST, LARGEST = 1e-3, 1e6
+"""Gravity in any unit of acceleration that a sensor is calibrated in: 1 for g, 9.8 for m/s^2, 1000 for mg."""
 
 
 def check_gravity(g: float) -> float:
     """Return g, in m/s^2 (or 1 for readings in units of g), or raise UsageError when it cannot be one."""
-    if not math.isfinite(g) or g <= 0:
+    if not SMALLEST <= g <= LARGEST:
         raise UsageError(
-            f"--g {g:g}: expected a positive number in m/s^2 (9.78 to 9.84 on Earth, 1 for units of g)"
+            f"--g {g:g}: expected gravity in m/s^2 (9.78 to 9.84 on Earth), or 1 for readings in units of g"
         )
     return g
 

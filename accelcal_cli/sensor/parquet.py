@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -64,15 +64,17 @@ class ParquetTable:
             yield Rows(start, numbers, text)
             start += frame.height
 
-    def where(self, row: int) -> str:
+    @property
+    def where(self) -> Callable[[int], str]:
         """Row number, counted from 1."""
-        return f"row {row + 1}"
+        return _row
 
     def close(self) -> None:
         """Remove the copy and close the file."""
+        self._source.stop()
         self._hashing.wait()
-        self._files.close()
         self._source.close()
+        self._files.close()
 
     def _copy(self) -> Path:
         try:
@@ -113,16 +115,20 @@ class ParquetTable:
             row = int(np.argmax(bad))
             value = numbers[row]
             what = "is empty or nan" if np.isnan(value) else f"{value:g} is too large or infinite"
-            where = f'{self.name}, {self.where(start + row)}, column "{self.names[column]}"'
+            where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
             raise DataError(f"{where}: {what}; a finite number was expected")
 
     def _labels(self, series: pl.Series, start: int, column: int) -> list[str]:
         labels: list[str | None] = series.to_list()
         for row, label in enumerate(labels):
             if not label:
-                where = f'{self.name}, {self.where(start + row)}, column "{self.names[column]}"'
+                where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
                 raise DataError(f"{where}: is empty; every row needs its position label")
         return [label or "" for label in labels]
+
+
+def _row(row: int) -> str:
+    return f"row {row + 1}"
 
 
 @contextmanager

@@ -72,21 +72,18 @@ class Readings:
         """Take readings from memory: output (J, 3) in sensor units, the rest as in the fields."""
         rows = _shaped("output", output, 3)
         poses = len(rows)
-        names = None if labels is None else tuple(str(label) for label in labels)
-        if names is not None and (len(names) != poses or len(set(names)) != poses):
-            raise DataError(f"{source}: {poses} different labels were expected, one a pose")
+        names = None if labels is None else _distinct(labels, poses)
         collector = Collector(source, Columns((0, 1, 2), ("1", "2", "3")))
         collector.add(Rows(0, rows))
         collector.finish()
         extras = Extras(
             names,
-            None if count is None else _checked_count(_shaped("count", count, 1, poses)[:, 0], source),
+            None if count is None else _counts(_shaped("count", count, 1, poses)[:, 0]),
             None if scatter is None else _shaped("scatter", scatter, 3, poses, gaps=True),
             None if reference is None else _shaped("reference", reference, 3, poses),
             None if temperature is None else _shaped("temperature", temperature, 1, poses, gaps=True)[:, 0],
         )
-        digest = hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest()
-        return cls._of(collector, extras, digest, None)
+        return cls._of(collector, extras, hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest(), None)
 
     @classmethod
     def _of(
@@ -153,9 +150,16 @@ def _refuse(table: Table, rows: Rows, bad: NDArray[np.bool_], column: int, expec
         )
 
 
-def _checked_count(count: Floats, source: str) -> Floats:
+def _distinct(labels: Sequence[str], poses: int) -> tuple[str, ...]:
+    names = tuple(str(label) for label in labels)
+    if len(names) != poses or len(set(names)) != poses:
+        raise DataError(f"labels: {poses} different labels were expected, one a pose")
+    return names
+
+
+def _counts(count: Floats) -> Floats:
     if ((count < 1) | (count != np.round(count))).any():
-        raise DataError(f"{source}: counts of 1 or more were expected")
+        raise DataError("count: whole numbers of 1 or more were expected")
     return count
 
 

@@ -32,11 +32,18 @@ class ByteSource:
     rows the hash would otherwise cost as much as the parsing.
     """
 
-    def __init__(self, stream: BinaryIO, name: str, *, head: int = HEAD, block: int = BLOCK) -> None:
-        """Read the first `head` bytes of `stream`; `block` is the size in bytes of every later read."""
+    def __init__(
+        self, stream: BinaryIO, name: str, *, head: int = HEAD, block: int = BLOCK, owned: bool = False
+    ) -> None:
+        """Read the first `head` bytes of `stream`; `block` is the size in bytes of every later read.
+
+        An `owned` stream is closed with the source.
+        """
         self.name = name
         self._stream = stream
         self._block = block
+        self._owned = owned
+        self._stopped = False
         self._hash = hashlib.sha256()
         self._hashing, self._reading = Beside(), Beside()
         self._may_read_ahead = stream.seekable()  # a pipe may block, and with it the end of the program
@@ -50,10 +57,14 @@ class ByteSource:
             if raw.startswith(magic):
                 raise DataError(f"{name}: is {what}")
 
+    def stop(self) -> None:
+        """Let `rest` end early, for a reader in another thread."""
+        self._stopped = True
+
     def close(self) -> None:
-        """Close the file (standard input stays open)."""
+        """Close the stream if it is ours."""
         self._reading.wait()
-        if self._stream is not sys.stdin.buffer:
+        if self._owned:
             self._stream.close()
 
     @property
@@ -83,7 +94,7 @@ class ByteSource:
 
     def rest(self) -> Iterator[bytes]:
         """Every byte after the head, uncut (for binary formats)."""
-        while not self.whole and (fresh := self._next()):
+        while not (self.whole or self._stopped) and (fresh := self._next()):
             yield fresh
 
     def _next(self) -> bytes:
@@ -128,7 +139,11 @@ def open_source(source: str | Path, stdin: BinaryIO | None = None) -> ByteSource
         raise DataError(f"{source}: no permission to read it") from problem
     except (OSError, ValueError) as problem:  # ValueError: a NUL in the name
         raise DataError(f"{source}: cannot be opened ({problem})") from problem
-    return ByteSource(stream, str(source))
+    try:
+        return ByteSource(stream, str(source), owned=True)
+    except BaseException:
+        stream.close()
+        raise
 
 
 def _neighbour(path: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
@@ -80,6 +81,7 @@ class RowStore:
             import tempfile  # costs as much as reading a small table
 
             self._file = tempfile.TemporaryFile(prefix="accelcal-", buffering=0)  # noqa: SIM115
+            weakref.finalize(self, self._file.close)
         self._file.seek(0, os.SEEK_END)
         for part in parts:
             view = part.data.cast("B")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -38,8 +38,9 @@ class Table(Protocol):
     def blocks(self, selection: Selection) -> Iterator[Rows]:
         """Read the selected columns, block after block, in constant memory."""
 
-    def where(self, row: int) -> str:
-        """How to name a row (from 0) that has been read, such as ``line 8``."""
+    @property
+    def where(self) -> Callable[[int], str]:
+        """How to name a row (from 0) that has been read, such as ``line 8``; outlives the table."""
 
     def close(self) -> None:
         """Release the file."""
@@ -76,9 +77,10 @@ class TextTable:
             if top < len(block):
                 yield parse(block[top:])
 
-    def where(self, row: int) -> str:
-        """Line of a row."""
-        return f"line {self._lines.line(row)}"
+    @property
+    def where(self) -> Callable[[int], str]:
+        """Line of a row that has been read."""
+        return self._lines.where
 
     def close(self) -> None:
         """Release the file."""

@@ -40,6 +40,8 @@ def tables(draw: st.DrawFn) -> tuple[bytes, Dialect, Selection]:
         separator.join(row)
         for row in draw(st.lists(st.lists(cells, min_size=width, max_size=width), max_size=12))
     ]
+    if draw(st.booleans()):
+        lines = [draw(quoted(line, separator)) for line in lines]
     for _ in range(oddity if lines else 0):
         at = draw(st.integers(0, len(lines) - 1))
         lines[at] = draw(odd_lines(lines[at], separator))
@@ -74,6 +76,27 @@ def odd_lines(draw: st.DrawFn, line: str, separator: str) -> str:
         case _:
             return draw(st.sampled_from([" ", "  ", "\t", " \t "])).join(["", *cells, ""])
     return separator.join(cells)
+
+
+@st.composite
+def quoted(draw: st.DrawFn, line: str, separator: str) -> str:
+    """A line with some of its cells in quotes, not all of them in the usual way."""
+    forms = [
+        "{}",
+        '"{}"',
+        '"{}"',
+        '"{}"',
+        '" {}"',
+        '"{}""1"',
+        '""{}""',
+        '"{}"x',
+        'x"{}"',
+        '"a{}',
+        '"a, b;{}"',
+        '""',
+    ]
+    usual = draw(st.integers(1, len(forms)))
+    return separator.join(draw(st.sampled_from(forms[:usual])).format(cell) for cell in line.split(separator))
 
 
 Outcome = tuple[list[tuple[str, ...]], list[str], list[int]] | str
@@ -139,6 +162,6 @@ def test_other_columns_take_the_fast_path_too() -> None:
     """A log with words in columns that are not read."""
     careful = CarefulParser("f", Dialect(",", False, None, 0, ("0",) * 3), Selection((1,), text=2))
     careful.parse = None  # type: ignore[method-assign, assignment]
-    rows = FastParser(careful).parse("état,2.5,üp side\n".encode() * 50)
-    assert rows.numbers.tolist() == [[2.5]] * 50
-    assert rows.text == ["üp side"] * 50
+    rows = FastParser(careful).parse('état,2.5,üp side\n"a b","2.5","üp side"\n'.encode() * 50)
+    assert rows.numbers.tolist() == [[2.5]] * 100
+    assert rows.text == ["üp side"] * 100

@@ -1,0 +1,59 @@
+# Needs Python 3.11 or newer with venv, and make; everything else is installed into .venv.
+
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+# pip settings that would install elsewhere, or not at all; those of the network stay.
+unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_NO_DEPS PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION
+unexport PIP_IGNORE_INSTALLED PIP_PYTHON PIP_REPORT PYTHONPATH PYTHONHOME
+
+.PHONY: help demo test lint types bench docs clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make demo    install into .venv and calibrate the simulated sample"
+	@echo "make test    run the tests"
+	@echo "make lint    ruff"
+	@echo "make types   mypy"
+	@echo "make bench   run the benchmarks"
+	@echo "make docs    write the tables and outputs in the documentation anew"
+	@echo "make clean   remove what make made"
+
+demo: $(VENV)/installed
+	$(BIN)/accelcal calibrate docs/sample.csv --g 9.80665
+
+test: $(VENV)/installed-test
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/installed-lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/installed-lint
+	$(BIN)/mypy
+
+bench: $(VENV)/installed-bench
+	$(BIN)/python -m benchmarks $(ARGS)
+
+docs: $(VENV)/installed-test
+	$(BIN)/python tests/test_docs.py
+
+$(VENV)/created:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed; name it with make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/installed: pyproject.toml | $(VENV)/created
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/installed-%: pyproject.toml | $(VENV)/created
+	$(PIP) --editable ".[$*]"
+	@touch $@ $(VENV)/installed
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find accelcal_cli tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,218 @@
+"""Our optimizers beside other tools': `python -m benchmarks.optimizers [--func rosenbrock] [--repeat 7]`.
+
+Everyone minimises the same function of 12 coordinates with 100 points and 500 iterations, in turn, in this one
+process and thread; the table gives the median of million evaluations a second and the medians' ratios.
+Peers: pip install pyswarms scikit-opt scipy mealpy pygmo fcmaes; one that is missing is skipped.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")  # before numpy reads them
+
+import argparse
+import logging
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from accelcal_cli.optimizers.base import OPTIMIZERS
+from accelcal_cli.optimizers.minimize import minimize
+from accelcal_cli.streams import Float
+from benchmarks.functions import FUNCTIONS, TestFunction
+
+POPULATION, ITERATIONS, D = 100, 500, 12
+PSO = {"w": 0.7298, "c1": 1.49618, "c2": 1.49618}
+OURS = [(name, runs) for name in ("pso", "de", "de-pso") for runs in (1, 20)]
+
+Job = Callable[[], object]
+"""One whole search. The points it asked for are counted by its Objective, or else it returns their number."""
+
+
+class Objective:
+    """The function as peers with a Python objective take it, the points it was asked for counted."""
+
+    def __init__(self, problem: TestFunction) -> None:
+        self.problem, self.points = problem, 0
+        self.lower, self.upper = problem.lower, problem.upper
+
+    def rows(self, x: Float) -> Float:
+        """Return costs of points, shape (P, D); laid out the way our own populations are before the sums."""
+        self.points += len(x)
+        return self.problem.cost(np.asfortranarray(x)[None])[0]
+
+    def columns(self, x: Float) -> Float:
+        """Return costs of points, shape (D, P)."""
+        return self.rows(x.T)
+
+    def one(self, x: Float) -> float:
+        """Return the cost of one point."""
+        return float(self.rows(np.asarray(x)[None])[0])
+
+
+def accelcal(objective: Objective, name: str, runs: int) -> Job:
+    optimizer = OPTIMIZERS.get(name)(population=POPULATION, iterations=ITERATIONS)
+    return lambda: int(minimize(objective.problem, optimizer, runs=runs).evaluations.sum())
+
+
+def pyswarms_pso(objective: Objective) -> Job:
+    from pyswarms.single import GlobalBestPSO
+
+    logging.disable(logging.INFO)
+    bounds = (objective.lower, objective.upper)
+    return lambda: GlobalBestPSO(POPULATION, D, PSO, bounds).optimize(
+        objective.rows, ITERATIONS, verbose=False
+    )
+
+
+def scikit_opt(objective: Objective, name: str) -> Job:
+    import sko.DE
+    import sko.PSO
+    from sko.tools import set_run_mode
+
+    def run() -> None:
+        rows = partial(objective.rows)
+        set_run_mode(rows, "vectorization")
+        common = {"n_dim": D, "max_iter": ITERATIONS, "lb": objective.lower, "ub": objective.upper}
+        if name == "pso":
+            sko.PSO.PSO(rows, pop=POPULATION, **common, **PSO).run()
+        else:
+            sko.DE.DE(rows, size_pop=POPULATION, **common).run()
+
+    return run
+
+
+def scipy_de(objective: Objective) -> Job:
+    from scipy.optimize import differential_evolution
+
+    def run() -> None:
+        start = np.random.default_rng(0).uniform(objective.lower, objective.upper, (POPULATION, D))
+        box = list(zip(objective.lower, objective.upper, strict=True))
+        settings = {"maxiter": ITERATIONS, "polish": False, "tol": 0.0, "atol": 0.0}
+        differential_evolution(
+            objective.columns, box, init=start, vectorized=True, updating="deferred", **settings
+        )
+
+    return run
+
+
+def mealpy_pso(objective: Objective) -> Job:
+    from mealpy import PSO as swarm
+    from mealpy import FloatVar
+
+    bounds = FloatVar(lb=objective.lower.tolist(), ub=objective.upper.tolist())
+    task = {"obj_func": objective.one, "bounds": bounds, "minmax": "min", "log_to": None}
+    return lambda: swarm.OriginalPSO(epoch=ITERATIONS, pop_size=POPULATION).solve(task)
+
+
+def fcmaes_de(objective: Objective) -> Job:
+    from fcmaes.decpp import DE_C
+    from scipy.optimize import Bounds
+
+    def run() -> None:
+        search = DE_C(D, Bounds(objective.lower, objective.upper), popsize=POPULATION)
+        for _ in range(ITERATIONS):
+            search.tell(objective.rows(np.asarray(search.ask())))
+
+    return run
+
+
+def pygmo_batch(objective: Objective) -> Job:
+    import pygmo
+
+    class Batched:
+        def fitness(self, x: Float) -> list[float]:
+            return [objective.one(x)]
+
+        def batch_fitness(self, x: Float) -> Float:
+            return objective.rows(x.reshape(-1, D))
+
+        def get_bounds(self) -> tuple[Float, Float]:
+            return objective.lower, objective.upper
+
+    def run() -> None:
+        method = pygmo.pso_gen(gen=ITERATIONS)
+        method.set_bfe(pygmo.bfe(pygmo.member_bfe()))
+        pygmo.algorithm(method).evolve(pygmo.population(pygmo.problem(Batched()), POPULATION))
+
+    return run
+
+
+def pygmo_native(objective: Objective, name: str) -> Job:
+    import pygmo
+
+    function = getattr(pygmo, objective.problem.name)(dim=D)
+    method = {
+        "pso": pygmo.pso(gen=ITERATIONS),
+        "de": pygmo.de(gen=ITERATIONS, ftol=0.0, xtol=0.0),
+    }[name]
+
+    def run() -> int:
+        population = pygmo.population(pygmo.problem(function), POPULATION)
+        return int(pygmo.algorithm(method).evolve(population).problem.get_fevals())
+
+    return run
+
+
+PEERS: dict[str, Callable[[Objective], Job]] = {
+    "pyswarms PSO": pyswarms_pso,
+    "scikit-opt PSO": partial(scikit_opt, name="pso"),
+    "scikit-opt DE": partial(scikit_opt, name="de"),
+    "SciPy differential_evolution": scipy_de,
+    "mealpy PSO, a point at a time": mealpy_pso,
+    "fcmaes DE in C++, ask/tell": fcmaes_de,
+    "pygmo pso_gen, numpy objective": pygmo_batch,
+    "pygmo pso, all C++": partial(pygmo_native, name="pso"),
+    "pygmo de, all C++": partial(pygmo_native, name="de"),
+}
+
+
+def rate(job: Job, objective: Objective) -> float:
+    """Return million evaluations a second of processor time of one search."""
+    before, start = objective.points, time.process_time()
+    returned = job()
+    seconds = time.process_time() - start
+    points = returned if isinstance(returned, int) else objective.points - before
+    return points / seconds / 1e6
+
+
+def measure(problem: TestFunction, repeat: int, console: Console) -> dict[str, float]:
+    """Return the median rate of everyone, all repetitions interleaved."""
+    objective = Objective(problem)
+    jobs = {f"{name} x {runs}": accelcal(objective, name, runs) for name, runs in OURS}
+    for name, adapter in PEERS.items():
+        try:
+            jobs[name] = adapter(objective)
+        except (ImportError, AttributeError) as error:
+            console.print(f"skipped {name}: {error}")
+    rates: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(repeat):
+        for name, job in jobs.items():
+            rates[name].append(rate(job, objective))
+    return {name: statistics.median(values) for name, values in rates.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--func", choices=sorted(FUNCTIONS), default="rosenbrock")
+    parser.add_argument("--repeat", type=int, default=7)
+    options = parser.parse_args()
+    console = Console(width=120)
+    rates = measure(FUNCTIONS[options.func](D), options.repeat, console)
+    ours = [f"{name} x {runs}" for name, runs in OURS]
+    table = Table("", "M eval/s", *ours, title=f"{options.func}: ours (x runs), and ours / theirs")
+    table.add_row("accelcal", "", *(f"{rates[name]:.2f}" for name in ours), end_section=True)
+    for peer in (name for name in rates if name not in ours):
+        ratios = (f"{rates[name] / rates[peer]:.2f}" for name in ours)
+        table.add_row(peer, f"{rates[peer]:.3g}", *ratios)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

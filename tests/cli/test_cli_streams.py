@@ -1,0 +1,182 @@
+"""Pipes, terminals, interrupts and closed streams: the real program in a real shell."""
+
+import errno
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-7]m")
+
+
+def one_line(outcome, *parts):
+    assert outcome.err.startswith("accelcal: ")
+    assert outcome.err.count("\n") == 1, outcome.err
+    for part in parts:
+        assert part in outcome.err
+
+
+def test_simulate_into_calibrate(shell):
+    outcome = shell("accelcal simulate --positions 24 | accelcal calibrate - --format json | cat")
+    assert json.loads(outcome.out)["verdict"] == "good"
+    assert outcome.code == 0
+
+
+def test_the_same_seed_gives_the_same_bytes_in_another_process(shell):
+    line = "accelcal simulate --sensor mems | accelcal calibrate - --seed 5 --format json --quiet"
+    assert shell(line, PYTHONHASHSEED="1").out == shell(line, PYTHONHASHSEED="2").out != ""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "accelcal simulate --positions 200000",
+        "accelcal simulate | accelcal calibrate - -q",
+        "accelcal --help",
+    ],
+)
+def test_a_reader_that_leaves_is_no_error(shell, line):
+    outcome = shell(f"{line} | head -1; exit ${{PIPESTATUS[-2]}}")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("stream", "parts"),
+    [
+        ("head -c 2G /dev/zero", ["<stdin>, line 1", "NUL"]),
+        ("yes 0,0,0", ["<stdin>", "readings are all equal"]),
+        ("tr '\\0' 1 </dev/zero", ["<stdin>, line 1", "longer than 1 MB"]),
+        ("head -c 3M /dev/urandom", ["<stdin>, line "]),
+    ],
+)
+def test_a_stream_of_nonsense_is_cut_off(shell, stream, parts):
+    outcome = shell(f"{stream} | accelcal calibrate - -o result.yaml")
+    assert outcome.code == 2
+    one_line(outcome, *parts)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "accelcal simulate",
+        "accelcal simulate | accelcal calibrate - -q",
+        "accelcal --help",
+        "accelcal --version",
+    ],
+)
+def test_a_full_device_is_one_message(shell, line):
+    outcome = shell(f"{line} > /dev/full")
+    assert outcome.code == 2
+    one_line(outcome, "cannot write", os.strerror(errno.ENOSPC).lower())
+
+
+def test_closed_streams(shell, tmp_path):
+    outcome = shell("accelcal calibrate - <&-")
+    assert outcome.code == 2
+    one_line(outcome, "<stdin>", "empty")
+    assert shell("accelcal simulate -o a.csv >&- 2>&- <&-").code == 0
+    assert shell("accelcal calibrate a.csv -o b.json >&- 2>&-").code == 0
+    assert json.loads((tmp_path / "b.json").read_text())["verdict"] == "good"
+
+
+def in_terminal(environment, folder, *arguments, **variables):
+    """Return what accelcal prints to a terminal, its exit code, and what it says on standard error."""
+    ours, theirs = pty.openpty()
+    program = subprocess.Popen(
+        [sys.executable, "-m", "accelcal_cli", *arguments],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=subprocess.PIPE,
+        cwd=folder,
+        env={**environment, "TERM": "xterm-256color", **variables},
+    )
+    os.close(theirs)
+    shown = b""
+    while True:
+        try:
+            part = os.read(ours, 65536)
+        except OSError:  # Linux reports the end of a terminal so
+            break
+        if not part:
+            break
+        shown += part
+    _, error = program.communicate()
+    os.close(ours)
+    return shown.decode(), program.returncode, error.decode()
+
+
+def test_colour_on_a_terminal_unless_refused(environment, good, tmp_path):
+    shown, code, _ = in_terminal(environment, tmp_path, "calibrate", good)
+    assert code == 0
+    assert COLOUR.search(shown)
+    assert not COLOUR.search(in_terminal(environment, tmp_path, "calibrate", good, NO_COLOR="1")[0])
+
+
+def test_no_colour_in_a_pipe(shell):
+    assert "\x1b" not in shell("accelcal simulate | accelcal calibrate -").out
+
+
+def test_readings_are_not_awaited_from_a_terminal(environment, tmp_path):
+    shown, code, error = in_terminal(environment, tmp_path, "calibrate", "-")
+    assert (shown, code) == ("", 2)
+    assert error.startswith("accelcal: -: standard input is a terminal; expected")
+
+
+def numbers(result):
+    """Return the numbers of a result as its tables show them."""
+    for row, sigmas, bias, sigma in zip(
+        result["K_a"], result["sigma"]["K_a"], result["D_a"], result["sigma"]["D_a"], strict=True
+    ):
+        yield from (f"{value:.8g}" for value in (*row, bias))
+        yield from (f"{value:.2g}" for value in (*sigmas, sigma))
+    yield from (f"{dop:.3f}" for dop in result["dop"]["parameters"].values())
+    yield from (f"{result[name]:.6g}" for name in ("rms", "rms_before", "s"))
+    yield f"{result['cost']:.9g}"
+    yield f"{result['evaluations']:,}"
+
+
+@pytest.mark.parametrize("columns", ["40", "60", "80", "200"])
+def test_no_terminal_is_too_narrow_for_a_digit(shell, columns):
+    shell("accelcal simulate --sensor mems --positions 24 > data.csv")
+    result = json.loads(shell("accelcal calibrate data.csv --format json").out)
+    outcome = shell("accelcal calibrate data.csv", COLUMNS=columns)
+    assert outcome.code == 0
+    assert "\N{HORIZONTAL ELLIPSIS}" not in outcome.out
+    assert max(map(len, outcome.out.splitlines())) <= int(columns)
+    words = set(outcome.out.split())
+    assert [number for number in numbers(result) if number not in words] == []
+
+
+def test_an_ascii_terminal_gets_ascii(shell):
+    outcome = shell("accelcal simulate | accelcal calibrate -", PYTHONIOENCODING="ascii")
+    assert outcome.code == 0
+    assert outcome.out.isascii()
+
+
+@pytest.mark.parametrize("busy", ["reading", "searching"])
+def test_an_interrupt_is_one_line_and_leaves_no_file(environment, tmp_path, busy):
+    program = subprocess.Popen(
+        [sys.executable, "-m", "accelcal_cli", "calibrate", "-", "--runs", "100000", "-o", "result.yaml"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=tmp_path,
+        env=environment,
+    )
+    rows = b"".join(b"%d,%d,%d\n" % (i % 7, i % 11, i % 13) for i in range(100_000))
+    program.stdin.write(rows)  # more than a pipe holds: when it is written the program is at work
+    if busy == "searching":
+        program.stdin.close()
+        program.stdin = None
+        with pytest.raises(subprocess.TimeoutExpired):
+            program.communicate(timeout=1)  # a hundred thousand searches take longer
+    program.send_signal(signal.SIGINT)
+    out, error = program.communicate()
+    assert (program.returncode, out, error) == (130, b"", b"accelcal: interrupted\n")
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,211 @@
+"""What every optimizer has to do, as functions that raise AssertionError when it does not.
+
+They take the class and build it with its defaults, so that a new file in `optimizers/` is held to them without
+an edit here. BUDGETS is for an algorithm whose defaults are too small or too large for these small problems.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from known_problems import CASES, Holed, Watched
+
+from accelcal_cli.optimizers.minimize import Status, Stopping, minimize
+
+RUNS = 3
+
+LARGEST_BUDGET = 110_000
+"""Evaluations of one run that an optimizer may use up."""
+
+BUDGETS: Mapping[str, Mapping[str, Any]] = {
+    "akpso": {"population": 100, "iterations": 300},
+    "full-foa": {"iterations": 2000},
+    "ifoa": {"iterations": 3000},
+    "kpso": {"iterations": 200},
+    "shade-cma": {"evaluations": 12_000, "iterations": 2000},
+}
+"""Settings by optimizer where the defaults are too large, or too small, for these small problems."""
+
+SHORT: Mapping[str, Mapping[str, Any]] = {
+    "shade-cma": {"population": 30, "evaluations": 1500, "iterations": 200},
+}
+"""Settings where 60 iterations do not pass through all that the algorithm does."""
+
+REACHED: Mapping[str, Mapping[str, float]] = {
+    "foa": {"rosenbrock": 0.12},
+    "full-foa": {"sphere": 0.08, "rosenbrock": 0.1, "residuals": 6e-3, "calibration": 0.5},
+    "kpso": {"sphere": 0.06, "rosenbrock": 0.08, "residuals": 1.2e-3, "calibration": 0.2},
+}
+"""A weaker cost that counts as reached, by optimizer and case: swarms with a radius or a noise that never shrinks
+stay on a floor. It is still several times below what random search finds."""
+
+BEYOND: Mapping[str, tuple[str, ...]] = {"foa": ("sphere", "residuals", "calibration")}
+"""Minima that an algorithm as published cannot reach (FOA's candidates are positive and near its swarm's radius)."""
+
+MAY_FAIL = ("newton",)
+"""Algorithms that diverge from many starting points: one run in three has to arrive, not two."""
+
+
+def build(cls):
+    """The optimizer with its defaults, or with its entry of BUDGETS."""
+    return cls(**BUDGETS.get(cls.name, {}))
+
+
+def short(cls):
+    """The optimizer for checks that do not need it to arrive: 60 iterations."""
+    if cls.name in SHORT:
+        return cls(**SHORT[cls.name])
+    return dataclasses.replace(build(cls), iterations=min(60, build(cls).iterations))
+
+
+def arrived(cls, cost, case):
+    """Whether enough runs have reached the minimum: two of three, so that one may be trapped."""
+    share = 1 / 3 if cls.name in MAY_FAIL else 2 / 3
+    return (cost <= reached(cls, case)).mean() >= share - 1e-9
+
+
+def searches(cls):
+    """Whether the optimizer searches at all: a closed form evaluates one point and has no second step."""
+    limits = {field.name: field.metadata for field in dataclasses.fields(cls)}
+    return limits["iterations"]["high"] != 1
+
+
+def cases(cls):
+    """Names of the known problems that offer what the optimizer needs."""
+    return [name for name, case in CASES.items() if build(cls).suits(case.make())]
+
+
+def reached(cls, case):
+    """The cost that counts as the minimum."""
+    return REACHED.get(cls.name, {}).get(case, CASES[case].reached)
+
+
+def reaches_the_minimum(cls, case):
+    problem = CASES[case].make()
+    run = minimize(problem, build(cls), runs=RUNS, seed=5)
+    assert arrived(cls, run.cost, case), f"{case}: best costs {run.cost}"
+    assert (run.evaluations <= LARGEST_BUDGET).all(), f"{case}: {run.evaluations} evaluations"
+    at_best = problem.cost(run.x[:, None, :])[:, 0]
+    np.testing.assert_allclose(at_best, run.cost, rtol=1e-6, atol=1e-20)
+
+
+def never_worsens(cls, case):
+    run = minimize(CASES[case].make(), short(cls), runs=RUNS, seed=6)
+    assert (np.diff(run.trace, axis=1) <= 0).all()
+    assert (np.diff(run.trace_evaluations, axis=1) >= 0).all()
+    np.testing.assert_array_equal(run.trace[:, -1], run.cost)
+    np.testing.assert_array_equal(run.trace_evaluations[:, -1], run.evaluations)
+    if searches(cls):
+        assert (run.trace[:, -1] < run.trace[:, 0]).any(), "not one improvement"
+        assert (run.trace_evaluations[:, -1] > run.trace_evaluations[:, 0]).all(), "not one evaluation"
+
+
+def keeps_to_the_box(cls, case):
+    problem = Watched(CASES[case].make())
+    minimize(problem, short(cls), runs=RUNS, seed=7)
+    points = problem.seen.all()
+    assert len(points) >= RUNS
+    assert (points >= problem.lower).all()
+    assert (points <= problem.upper).all()
+
+
+def counts_every_evaluation(cls, case):
+    problem = Watched(CASES[case].make())
+    run = minimize(problem, short(cls), runs=1, seed=8)
+    assert problem.seen.evaluations == run.evaluations[0] > 0
+    many = Watched(CASES[case].make())
+    batch = minimize(many, short(cls), runs=3, seed=8)
+    assert many.seen.evaluations == batch.evaluations.sum()
+    assert batch.evaluations[0] == run.evaluations[0]
+    if searches(cls):
+        assert len(np.unique(problem.seen.all(), axis=0)) > 3, "it stays where it started"
+
+
+def alone_equals_batch(cls, case):
+    problem = CASES[case].make()
+    batch = minimize(problem, short(cls), runs=5, seed=9)
+    for number in (0, 2, 4):
+        alone = minimize(problem, short(cls), runs=[number], seed=9)
+        for name in ("x", "cost", "evaluations", "iterations"):
+            one, many = getattr(alone, name)[0], getattr(batch, name)[number]
+            assert one.tobytes() == many.tobytes(), f"{case}: {name} of run {number}"
+        length = alone.trace.shape[1]
+        assert alone.trace[0].tobytes() == batch.trace[number, :length].tobytes()
+        assert alone.status[0] == batch.status[number]
+    different = len(np.unique(batch.trace[:, 0]))
+    assert different == (5 if searches(cls) else 1), "runs are copies of each other"
+
+
+def a_seed_repeats(cls, case):
+    def points(seed):
+        problem = Watched(CASES[case].make())
+        minimize(problem, short(cls), runs=2, seed=seed)
+        return problem.seen.all().tobytes()
+
+    first = points(11)
+    assert first == points(11)
+    if searches(cls):
+        assert first != points(12)
+
+
+def survives_nan(cls, case):
+    problem = Holed(CASES[case].make())
+    run = minimize(problem, build(cls), runs=5, seed=13)
+    alive = np.isfinite(run.cost)
+    for well, status in zip(alive, run.status, strict=True):
+        assert well != (status is Status.FAILED)
+    assert (run.x[alive, 0] >= problem.edge).all()
+    if case not in BEYOND.get(cls.name, ()):
+        assert (run.cost[alive] <= reached(cls, case)).any(), f"{case}: best costs {run.cost}"
+    # A population of many has points outside the hole, and has to find its way from them.
+    assert alive.all() or build(cls).population == 1
+    nowhere = minimize(Holed(CASES[case].make(), share=2.0), build(cls), runs=2, seed=13)
+    assert nowhere.status == (Status.FAILED, Status.FAILED)
+
+
+def stops_at_the_tolerance(cls, case):
+    problem = CASES[case].make()
+    free = minimize(problem, short(cls), runs=1, seed=14)
+    if not searches(cls):
+        assert minimize(problem, short(cls), seed=14, stopping=Stopping(1e9)).cost[0] <= 1e9
+        return
+    assert free.cost[0] < free.trace[0, 0]
+    tolerance = float(np.sqrt(free.trace[0, 0] * max(free.cost[0], 1e-6 * free.trace[0, 0])))
+    run = minimize(problem, short(cls), runs=1, seed=14, stopping=Stopping(tolerance=tolerance))
+    steps = int(np.argmax(free.trace[0] <= tolerance))
+    assert 0 < steps < free.trace.shape[1]
+    assert run.status == (Status.TOLERANCE,)
+    assert run.iterations[0] == steps
+    assert run.cost[0] <= tolerance
+    np.testing.assert_array_equal(run.trace[0], free.trace[0, : steps + 1])
+
+
+def stops_at_the_budget(cls, case):
+    problem = CASES[case].make()
+    free = minimize(problem, short(cls), runs=1, seed=15)
+    counts = free.trace_evaluations[0]
+    if not searches(cls):
+        assert counts[-1] == 1
+        return
+    for step in (1, 3):
+        budget = int(counts[step - 1]) + 1
+        run = minimize(problem, short(cls), runs=1, seed=15, stopping=Stopping(evaluations=budget))
+        assert run.status == (Status.EVALUATIONS,)
+        assert run.evaluations[0] == counts[step]  # the step under way is finished, no other is started
+        assert run.iterations[0] == step
+
+
+CONTRACT = (
+    reaches_the_minimum,
+    never_worsens,
+    keeps_to_the_box,
+    counts_every_evaluation,
+    alone_equals_batch,
+    a_seed_repeats,
+    survives_nan,
+    stops_at_the_tolerance,
+    stops_at_the_budget,
+)

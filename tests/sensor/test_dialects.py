@@ -1,0 +1,96 @@
+"""Tables written in any dialect read back as the same numbers."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.dialect import sniff
+from accelcal_cli.sensor.readings import read_readings
+
+NUMBERS = st.floats(-1e9, 1e9).map(lambda value: value + 0.0)
+ROWS = st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=2, max_size=12)
+
+
+@st.composite
+def written(draw: st.DrawFn) -> tuple[bytes, list[tuple[float, float, float]]]:
+    """Rows, and the bytes of a file that holds them in some dialect."""
+    rows = draw(ROWS.filter(lambda rows: len(set(rows)) > 1))
+    separator = draw(st.sampled_from([",", ";", "\t", "  ", " ", ", ", " \t"]))
+    comma = draw(st.booleans())
+    quoted = comma if separator.strip() == "," else draw(st.sampled_from([False, False, True]))
+    lines = [separator.join(_cell(value, comma, quoted) for value in row) for row in rows]
+    if draw(st.booleans()):
+        lines.insert(0, separator.join(draw(st.sampled_from([("ax", "ay", "az"), ("u", "v", "w")]))))
+    for _ in range(draw(st.integers(0, 2))):
+        lines.insert(draw(st.integers(0, len(lines))), draw(st.sampled_from(["", "  ", "# 1,5; note"])))
+    if draw(st.booleans()):
+        lines = ["  " + line for line in lines]
+    text = draw(st.sampled_from(["\n", "\r\n", "\r"])).join([*lines, ""] if draw(st.booleans()) else lines)
+    return draw(st.sampled_from([b"", b"\xef\xbb\xbf"])) + text.encode(), rows
+
+
+def _cell(value: float, comma: bool, quoted: bool) -> str:
+    text = repr(value).replace(".", ",") if comma else repr(value)
+    return f'"{text}"' if quoted else text
+
+
+@settings(max_examples=300, deadline=None)
+@given(written())
+def test_same_numbers_in_every_dialect(table: tuple[bytes, list[tuple[float, float, float]]]) -> None:
+    data, rows = table
+    readings = read_readings("-", stdin=io.BytesIO(data))
+    np.testing.assert_array_equal(readings.output(), np.array(rows))
+
+
+@pytest.mark.parametrize(
+    ("text", "separator", "decimal_comma", "names"),
+    [
+        ("1,2,3\n4,5,6\n", ",", False, None),
+        ("1.5, 2, 3\n4, 5, 6\n", ",", False, None),
+        ("1,5 2,5 3,5\n4 5 6\n", " ", True, None),
+        ("a;b;c\n1,5;2;3\n", ";", True, ("a", "b", "c")),
+        ("a;b;c\n1.5;2;3\n", ";", False, ("a", "b", "c")),
+        ("1\t\t2\t3\n10\t\t2\t3\n", " ", False, None),
+        ("a\tb\tc\n1\t\t3\n1\t2\t3\n", "\t", False, ("a", "b", "c")),
+        ("up side,1,2,3\ndown side,4,5,6\n", ",", False, None),
+        ("2024-01-01 10:00:00,1,2,3\n2024-01-01 10:00:01,1,2,3\n", ",", False, None),
+        ("ax [m/s^2] ay [m/s^2] az\n1 2 3\n", " ", False, ("ax [m/s^2]", "ay [m/s^2]", "az")),
+        ("# t ax ay az\n0 1 2 3\n", " ", False, ("t", "ax", "ay", "az")),
+        ("# made by hand\n0 1 2 3\n", " ", False, None),
+        (",0,1,2\n0,1.5,2.5,3.5\n", ",", False, ("", "0", "1", "2")),
+        ("0,1,2\n3,4,5\n", ",", False, None),
+        ("a,b,c,\n1,2,3,\n", ",", False, ("a", "b", "c")),
+        ("a,b,c,d\n1,2,3,\n", ",", False, ("a", "b", "c", "d")),
+        ('"a","b","c"\n"1,5","2","3"\n', ",", True, ("a", "b", "c")),
+    ],
+)
+def test_dialect(text: str, separator: str, decimal_comma: bool, names: Sequence[str] | None) -> None:
+    found = sniff(text.encode(), "f")
+    assert (found.separator, found.decimal_comma, found.names) == (separator, decimal_comma, names)
+
+
+def test_width_of_a_headerless_table_leaves_out_the_trailing_separator() -> None:
+    assert sniff(b"1,2,3,\n4,5,6,\n", "f").width == 3
+
+
+@pytest.mark.parametrize("data", [b"", b"\n \n\t\n", b"# only a comment\n", b",,,\n;;\n", b"\xef\xbb\xbf"])
+def test_nothing_in_it(data: bytes) -> None:
+    with pytest.raises(DataError, match="f: is empty"):
+        sniff(data, "f")
+
+
+def test_thousands_separators_are_no_numbers() -> None:
+    with pytest.raises(DataError, match=r'line 2, column 1: "1\.234,5" is not a number here: .* comma'):
+        read_readings("-", stdin=io.BytesIO(b"1,5;2;3\n1.234,5;2;3\n"))
+
+
+def test_decimal_mark_must_stay_the_same() -> None:
+    with pytest.raises(DataError, match=r'line 2, column 2: "2,5" is not a number here: .* point'):
+        read_readings("-", stdin=io.BytesIO(b"1.5;2;3\n1;2,5;3\n"))

@@ -1,0 +1,61 @@
+"""The row store gives back what was put in, from memory or from disk."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.spool import RowStore
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 20), max_size=12), st.integers(0, 60), st.integers(1, 30))
+def test_rows_come_back_in_order(sizes: list[int], limit: int, block: int) -> None:
+    rows = np.random.default_rng(0).normal(size=(sum(sizes), 3))
+    store = RowStore(3, limit)
+    for end, size in zip(np.cumsum(sizes), sizes, strict=True):
+        store.append(rows[end - size : end])
+    assert store.rows == len(rows)
+    for _ in range(2):
+        blocks = list(store.blocks(block))
+        assert [start for start, _ in blocks] == list(range(0, len(rows), block))
+        np.testing.assert_array_equal(np.concatenate([np.empty((0, 3)), *(b for _, b in blocks)]), rows)
+    np.testing.assert_array_equal(store.all(), rows)
+
+
+def test_two_readers_and_a_late_writer_do_not_disturb_each_other() -> None:
+    store = RowStore(1, limit=0)
+    store.append(np.arange(6.0)[:, None])
+    one, other = store.blocks(2), store.blocks(3)
+    assert next(one)[1].ravel().tolist() == [0, 1]
+    assert next(other)[1].ravel().tolist() == [0, 1, 2]
+    store.append(np.array([[6.0]]))
+    assert next(one)[1].ravel().tolist() == [2, 3]
+    assert store.all().ravel().tolist() == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_what_is_stored_cannot_be_changed_from_outside() -> None:
+    rows = np.ones((2, 3))
+    store = RowStore()
+    store.append(rows)
+    rows[:] = 7
+    assert store.all().tolist() == [[1, 1, 1], [1, 1, 1]]
+    with pytest.raises(ValueError, match="read-only"):
+        store.all()[0] = 5
+
+
+def test_full_disk_is_said_clearly(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: io.FileIO("/dev/full", "r+"))
+    store = RowStore(3, limit=0)
+    store.append(np.ones((100_000, 3)))
+    with pytest.raises(DataError, match=r"temporary file .* failed \(No space left on device\); free some"):
+        store.all()

@@ -1,0 +1,78 @@
+"""Random streams: every run draws its own numbers, whatever its company."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from accelcal_cli.streams import Streams
+
+
+@given(
+    st.lists(st.integers(0, 1000), min_size=1, max_size=6, unique=True),
+    st.integers(0, 2**63),
+    st.integers(1, 20),
+    st.integers(1, 5),
+)
+def test_a_run_draws_the_same_alone_and_in_any_company(runs, seed, rows, columns):
+    batch = Streams(seed, runs)
+    first, second = batch.uniform(rows, columns), batch.normal(rows, columns)
+    for place, run in enumerate(runs):
+        alone = Streams(seed, [run])
+        assert alone.uniform(rows, columns)[0].tobytes() == first[place].tobytes()
+        assert alone.normal(rows, columns)[0].tobytes() == second[place].tobytes()
+
+
+@pytest.mark.parametrize("draw", ["uniform", "normal"])
+def test_runs_seeds_and_purposes_differ(draw):
+    def numbers(seed, run, purpose=0):
+        return getattr(Streams(seed, [run], purpose), draw)(4, 3).tobytes()
+
+    combinations = [(seed, run, purpose) for seed in (0, 1, 2) for run in (0, 1, 2) for purpose in (0, 1)]
+    assert len({numbers(*combination) for combination in combinations}) == len(combinations)
+
+
+def test_a_stream_goes_on():
+    rng = Streams(0, [0, 1])
+    assert rng.uniform(5, 2).tobytes() != rng.uniform(5, 2).tobytes()
+
+
+def test_take_goes_on_where_the_runs_stand():
+    """Runs that end leave the batch; the others draw on as if nothing had happened."""
+    rng, whole = Streams(3, range(5)), Streams(3, range(5))
+    rng.uniform(4, 2), whole.uniform(4, 2)
+    part = rng.take(np.array([1, 4]))
+    assert len(part) == 2
+    assert part.uniform(4, 2).tobytes() == whole.uniform(4, 2)[[1, 4]].tobytes()
+
+
+def test_shapes_and_statistics():
+    rng = Streams(1, range(3))
+    u, z = rng.uniform(20_000, 2), rng.normal(20_000, 2)
+    assert u.shape == z.shape == (3, 20_000, 2)
+    assert (u >= 0).all()
+    assert (u < 1).all()
+    n = u.size
+    assert abs(u.mean() - 0.5) < 5 / np.sqrt(12 * n)
+    assert abs(u.var() - 1 / 12) < 0.01 / 12
+    assert abs(z.mean()) < 5 / np.sqrt(n)
+    assert abs(z.var() - 1) < 0.02
+    assert abs((z**3).mean()) < 0.05
+    correlation = np.corrcoef(u.transpose(0, 2, 1).reshape(6, -1))
+    assert np.abs(correlation - np.eye(6)).max() < 0.03
+
+
+def test_the_population_axis_is_contiguous():
+    assert Streams(0, [0]).uniform(100, 12).strides[1] == 8
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_few_rows(rows):
+    assert Streams(0, [0, 1]).uniform(rows, 3).shape == (2, rows, 3)
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(ValueError, match="negative"):
+        Streams(-1, [0])
