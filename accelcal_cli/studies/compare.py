@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +16,14 @@ from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.units import ARCSEC, MICRO_G, PPM
 from accelcal_cli.streams import Float
 from accelcal_cli.studies.scene import Recording, Scene, Search, Simulation, recorded, simulated, starting_points
-from accelcal_cli.studies.study import Entry, Record, Study, Task, records_of
+from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of
 from accelcal_cli.table import Column, Table
 
 WITHIN = 0.01
 """A run has reached the least cost when it is at most this part above it."""
+
+ROUNDING = 1e-12
+"""An excess of the cost below this part is rounding."""
 
 ERRORS = ("bias_error", "scale_error", "misalignment_error")
 
@@ -56,6 +60,11 @@ class Comparison(Study):
     def runs(self) -> int:
         """Runs of each optimizer."""
         return self.repeats
+
+    @property
+    def block(self) -> int:
+        """Runs of one task: many runs in one batch cost little more than a few."""
+        return max(5, self.repeats // 5)
 
     def names(self, cell: int) -> dict[str, str]:
         """Return the optimizer of a cell."""
@@ -179,7 +188,7 @@ def summary(study: Comparison, records: Sequence[Record], only_successful: bool 
         own = [r for r in records if r.cell == cell]
         if own:
             rows.append((entry.label, *_row(study, own, only_successful)))
-    return Table("Comparison", COLUMNS, tuple(rows), notes=_notes(study))
+    return Table("Comparison", COLUMNS, tuple(rows), notes=(*_notes(study), *_missed(rows)))
 
 
 def succeeded(study: Comparison, record: Record) -> bool:
@@ -199,10 +208,26 @@ def _row(study: Comparison, own: Sequence[Record], only_successful: bool) -> tup
         _count([r.evaluations for r in judged]),
         _count(hits),
         _median([r.cost for r in judged]),
-        _median([r.cost / r.values["least_cost"] - 1.0 for r in judged]) if _noisy(study) else None,
+        _median([_excess(r) for r in judged]) if _noisy(study) else None,
         *(_total(judged, name) for name in ERRORS),
         _total(judged, "efficiency"),
     )
+
+
+def curves(study: Comparison, records: Sequence[Record]) -> Mapping[str, tuple[Float, Float]]:
+    """Return the median convergence (evaluations, cost) by optimizer."""
+    found = {}
+    for cell, entry in enumerate(study.entries):
+        curve = median_curve([r for r in records if r.cell == cell])
+        if curve is not None:
+            found[entry.label] = curve
+    return found
+
+
+def _excess(record: Record) -> float:
+    """Return the part by which a run's cost is above the least cost; what is only rounding is zero."""
+    excess = record.cost / (record.values["least_cost"] or np.nan) - 1.0
+    return 0.0 if abs(excess) < ROUNDING else excess
 
 
 def _noisy(study: Comparison) -> bool:
@@ -221,6 +246,17 @@ def _total(records: Sequence[Record], name: str) -> float | None:
     """Return the rms over the runs of one of their values; None where no run has it."""
     values = [v for r in records if (v := r.values.get(name)) is not None]
     return float(np.sqrt(np.mean(np.square(values)))) if values else None
+
+
+def _missed(rows: Sequence[Sequence[Any]]) -> list[str]:
+    """Return a sentence for each optimizer that did not always come to the least cost of noisy readings."""
+    rate, excess = (next(i for i, c in enumerate(COLUMNS) if c.name == name) for name in ("success", "excess"))
+    return [
+        f"{row[0]} came within 1 % of the least cost in {row[rate]:.0%} of its runs; its median run is "
+        f"{'within 1 %' if row[excess] <= WITHIN else f'{1.0 + row[excess]:.3g} times as high'}."
+        for row in rows
+        if row[excess] is not None and row[rate] < 1.0
+    ]
 
 
 def _notes(study: Comparison) -> tuple[str, ...]:
