@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.errors import OutputError, UsageError
+from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.studies.engine import Executors
+    from accelcal_cli.studies.engine import Executors, Journal
     from accelcal_cli.studies.engine import Progress as Report
     from accelcal_cli.studies.study import Record, Study
 
-INTERRUPTED = 130
 MOST_JOBS = 1024
 RAW_SUFFIXES = (".csv", ".parquet")
 PLOT_SUFFIXES = (".png", ".svg")
@@ -88,15 +87,21 @@ def run(
         if raw is not None:
             write_raw(raw_table(study, records), raw)
     except KeyboardInterrupt:
-        kept = (
-            f"; {len(journal.done)} of {len(study.tasks())} parts are kept, --resume goes on" if raw else ""
-        )
-        typer.echo(f"accelcal: interrupted{kept}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
-    except OutputError as error:
-        raise OutputError(f"{error}; finished runs are kept, --resume goes on") from None
+        raise Interrupted(f"interrupted{_kept(journal)}") from None
+    except AccelcalError as error:
+        raise type(error)(f"{error}{_kept(journal)}") from None
     journal.remove()
     return records
+
+
+def _kept(journal: Journal) -> str:
+    """Return what to say of finished runs after a failure; a journal without any goes."""
+    if not journal.done:
+        journal.remove()
+    if journal.path is None or not journal.done:
+        return ""
+    runs = sum(map(len, journal.done.values()))
+    return f"; {runs:,} finished runs are kept in {journal.path}, --resume goes on with them"
 
 
 def _check(raw: str | None, jobs: int, cluster: str | None, resume: bool) -> None:

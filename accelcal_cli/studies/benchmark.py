@@ -54,6 +54,13 @@ class Benchmark(Study):
         """Runs of each cell."""
         return self.repeats
 
+    @property
+    def title(self) -> str:
+        """What is run, in one line."""
+        runs = "1 run" if self.repeats == 1 else f"{self.repeats:,} runs"
+        changes = ", shifted" * self.shift + ", rotated" * self.rotate
+        return f"Benchmark: D = {self.dimensions}, {runs}, tolerance {self.tolerance:g}, seed {self.seed}{changes}"
+
     @cached_property
     def pairs(self) -> tuple[tuple[str, Entry], ...]:
         """Function name and optimizer of every cell."""
@@ -163,11 +170,11 @@ COLUMNS = (
     Column("optimizer"),
     Column("runs", format=",d"),
     Column("evaluations", format=",d"),
-    Column("min", format=".2e"),
-    Column("max", format=".2e"),
-    Column("mean", format=".2e"),
-    Column("variance", format=".2e"),
-    Column("median", format=".2e"),
+    Column("min", format=".3g"),
+    Column("max", format=".3g"),
+    Column("mean", format=".3g"),
+    Column("variance", format=".3g"),
+    Column("median", format=".3g"),
     Column("success", format=".0%", key="success_rate"),
     Column("to tolerance", format=",d", key="evaluations_to_tolerance"),
     Column("failed", format="d", key="failures"),

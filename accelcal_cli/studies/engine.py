@@ -80,9 +80,8 @@ class Journal:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise OutputError(
-                f"{self.path}: cannot be written: {(error.strerror or str(error)).lower()}; --resume goes on later"
-            ) from None
+            reason = (error.strerror or str(error)).lower()
+            raise OutputError(f"{self.path}: cannot be written: {reason}") from None
 
     def _read(self, head: dict[str, str]) -> bool:
         """Take up what the file holds; False when not even its head was written. Cuts a half-written last line."""

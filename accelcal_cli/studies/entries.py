@@ -115,19 +115,23 @@ def _entry(item: Any, where: str) -> Entry:
 def limited(entry: Entry, budget: Budget) -> Entry:
     """Return an optimizer with the population, iterations and evaluations of a study.
 
+    A setting that can have one value only, such as the population of a closed form, stays.
+
     Raises:
         ConfigError: a value that the optimizer does not permit.
     """
+    limits = {f.name: f.metadata for f in dataclasses.fields(OPTIMIZERS.get(entry.optimizer))}
     stated = {"population": budget.population, "iterations": budget.iterations}
-    parameters = {**entry.parameters, **{k: v for k, v in stated.items() if v is not None}}
-    if budget.evaluations is not None:
-        fields = {f.name: f for f in dataclasses.fields(OPTIMIZERS.get(entry.optimizer))}
-        if "evaluations" in fields:
-            least = fields["evaluations"].metadata["low"]
-            parameters["evaluations"] = max(budget.evaluations, least)
-        elif budget.iterations is None:
-            population = dataclasses.replace(entry, parameters=parameters).build().population
-            parameters["iterations"] = max(1, -(-budget.evaluations // population) - 1)
-    limited = dataclasses.replace(entry, parameters=parameters)
-    limited.build()
-    return limited
+    stated = {k: v for k, v in stated.items() if v is not None and limits[k]["low"] != limits[k]["high"]}
+    changed = dataclasses.replace(entry, parameters={**entry.parameters, **stated})
+    if budget.evaluations is None:
+        changed.build()
+        return changed
+    more = {}
+    if "evaluations" in limits:
+        more["evaluations"] = max(budget.evaluations, int(limits["evaluations"]["low"]))
+    elif budget.iterations is None and limits["iterations"]["high"] != 1:
+        more["iterations"] = max(1, -(-budget.evaluations // changed.build().population) - 1)
+    changed = dataclasses.replace(changed, parameters={**changed.parameters, **more})
+    changed.build()
+    return changed

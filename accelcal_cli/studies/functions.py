@@ -6,7 +6,7 @@ rotated about it: an optimizer that only finds the centre, or only moves along t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +53,22 @@ FUNCTIONS = {
 PAPER = ("sphere", "rosenbrock", "rastrigin", "griewank")
 
 
+def select(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of known test functions; none means those of the paper, "all" means all.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    for name in names:
+        if name != "all" and name not in FUNCTIONS:
+            raise ConfigError(_unknown(name))
+    return tuple(FUNCTIONS) if "all" in names else tuple(names) or PAPER
+
+
+def _unknown(name: str) -> str:
+    return f'unknown function "{name}"{did_you_mean(name, FUNCTIONS)}; known: {", ".join(FUNCTIONS)}'
+
+
 class TestFunction(Problem):
     """A test function over its box, its optimum possibly moved and its coordinates turned.
 
@@ -75,9 +91,7 @@ class TestFunction(Problem):
     ) -> None:
         """Draw the place of the optimum and the rotation."""
         if name not in FUNCTIONS:
-            raise ConfigError(
-                f'unknown function "{name}"{did_you_mean(name, FUNCTIONS)}; known: {", ".join(FUNCTIONS)}'
-            )
+            raise ConfigError(_unknown(name))
         definition = FUNCTIONS[name]
         self.name, self.definition = name, definition
         self.lower, self.upper = (

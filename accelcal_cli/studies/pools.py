@@ -69,7 +69,7 @@ def _work() -> None:
 
 def _leave_with(parent: BaseProcess) -> None:
     parent.join()
-    os._exit(1)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 @contextmanager
@@ -81,13 +81,14 @@ def cluster(address: str) -> Iterator[Executor]:
             version of accelcal, or the cluster is lost on the way.
     """
     try:
-        from distributed import Client
+        import distributed
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
     where = f"--cluster {address}"
+    connect: Any = distributed.Client
     try:
-        client: Any = Client(address, timeout=ANSWER_TIME, set_as_default=False)  # type: ignore[no-untyped-call]
+        client = connect(address, timeout=ANSWER_TIME, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DataError(f"{where}: no Dask scheduler answers there ({error})") from None
     with client:
@@ -95,7 +96,7 @@ def cluster(address: str) -> Iterator[Executor]:
         try:
             yield client.get_executor(pure=False)
         except (KilledWorker, CancelledError, OSError) as error:
-            raise DataError(f"{where}: lost: {str(error).splitlines()[0]}; finished runs are kept") from None
+            raise DataError(f"{where}: lost ({type(error).__name__} {error})") from None
 
 
 def _check_workers(client: Any, where: str) -> None:

@@ -100,7 +100,7 @@ def table(result: Ranking) -> Table:
     )
     p = (None, *result.p[1:])
     return Table(
-        f"Ranks by median cost over {result.functions} functions (1 is best)",
+        f"Ranks over {result.functions} functions",
         columns,
         tuple(zip(result.labels, result.ranks, p, strict=True)),
         _notes(result),
@@ -108,7 +108,7 @@ def table(result: Ranking) -> Table:
 
 
 def _notes(result: Ranking) -> tuple[str, ...]:
-    notes = []
+    notes = ["Mean rank by the median cost on each function; 1 is best, ties share."]
     if result.p_friedman is not None:
         verdict = "differ" if result.p_friedman < LEVEL else "are not shown to differ"
         notes.append(

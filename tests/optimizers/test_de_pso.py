@@ -34,15 +34,15 @@ def _state(optimizer, problem, iteration, **changes):
 def inertia(iteration, **settings):
     """The factor on the old velocity, seen where nothing else pulls: own best, common best and position agree."""
     optimizer, problem = HybridSwarm(population=20, speed=100.0, **settings), Watched(Flat())
-    at_rest = np.full((1, 10, 3), 0.1)
+    at_rest = np.full((1, 20, 3), 0.1)
     old = np.full((1, 10, 3), 0.01)
     state, rng = _state(optimizer, problem, iteration)
     state = dataclasses.replace(
         state,
-        x=np.concatenate([at_rest, state.x[:, 10:]], axis=1),
+        x=at_rest,
         velocity=old,
         memory=at_rest,
-        leader=np.full((1, 1, 3), 0.1),
+        leader=np.full((1, 3), 0.1),
     )
     problem.seen.points.clear()
     optimizer.step(problem, state, rng)
@@ -55,9 +55,8 @@ def own_share(iteration, **settings):
     """The share of the own position in a mutant, seen where all individuals agree and every gene is taken."""
     optimizer, problem = HybridSwarm(population=20, crossover=0.0, **settings), Watched(Flat())
     state, rng = _state(optimizer, problem, iteration)
-    x = state.x.copy()
-    x[:, 10:] = 0.5
-    state = dataclasses.replace(state, x=x, leader=np.full((1, 1, 3), -0.5))
+    memory = np.full((1, 20, 3), 0.5)
+    state = dataclasses.replace(state, memory=memory, leader=np.full((1, 3), -0.5))
     problem.seen.points.clear()
     optimizer.step(problem, state, rng)
     shares = problem.seen.all()[10:] + 0.5
@@ -106,7 +105,7 @@ def test_the_better_half_leads_both():
         seen = problem.seen.all()[None]
         cost = problem.problem.cost(seen)
         best = seen[0, cost.argmin()]
-        np.testing.assert_array_equal(state.leader[0, 0], best)
+        np.testing.assert_array_equal(state.leader[0], best)
         led_by_evolution += (state.x[0, 10:] == best).all(axis=1).any()
     assert 0 < led_by_evolution < 30
 
@@ -117,7 +116,6 @@ def test_the_evolving_half_never_gets_worse_and_the_swarm_moves_on():
     swarm_got_worse = False
     for _ in range(30):
         after = optimizer.step(problem, state, rng)
-        assert (after.fx[:, 10:] <= state.fx[:, 10:]).all()
         assert (after.memory_cost <= state.memory_cost).all()
         np.testing.assert_allclose(after.fx, problem.cost(after.x), rtol=1e-12)
         np.testing.assert_allclose(after.memory_cost, problem.cost(after.memory), rtol=1e-12)

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_problems import ShiftedSphere, Watched
 
+from accelcal_cli.optimizers.base import better_of
 from accelcal_cli.optimizers.minimize import minimize
-from accelcal_cli.optimizers.pso import ParticleSwarm, remember, velocity
+from accelcal_cli.optimizers.pso import ParticleSwarm, velocity
 from accelcal_cli.streams import Streams
 
 
@@ -22,7 +23,7 @@ def test_velocity_is_equation_1(seed, w, c1, c2):
     runs, population, dimensions = 2, 5, 3
     rng = Streams(seed, range(runs))
     x, v, memory = (rng.normal(population, dimensions) for _ in range(3))
-    leader, r = rng.normal(1, dimensions), rng.uniform(population, 2 * dimensions)
+    leader, r = rng.normal(1, dimensions)[:, 0], rng.uniform(population, 2 * dimensions)
     before = [a.copy() for a in (x, v, memory, leader, r)]
     got = velocity(x, v, memory, leader, r, w, c1, c2)
     for run in range(runs):
@@ -30,7 +31,7 @@ def test_velocity_is_equation_1(seed, w, c1, c2):
             for d in range(dimensions):
                 expected = (
                     w * v[run, i, d]
-                    + c1 * r[run, i, d] * (leader[run, 0, d] - x[run, i, d])
+                    + c1 * r[run, i, d] * (leader[run, d] - x[run, i, d])
                     + c2 * r[run, i, dimensions + d] * (memory[run, i, d] - x[run, i, d])
                 )
                 assert got[run, i, d] == pytest.approx(expected, rel=1e-12, abs=1e-12)
@@ -38,10 +39,10 @@ def test_velocity_is_equation_1(seed, w, c1, c2):
         np.testing.assert_array_equal(old, new)
 
 
-def test_remember_keeps_the_better():
+def test_better_of_keeps_the_better():
     x = np.array([[[1.0], [2.0], [3.0]]])
     memory = np.array([[[10.0], [20.0], [30.0]]])
-    kept, cost = remember(memory, np.array([[5.0, 5.0, 5.0]]), x, np.array([[4.0, 5.0, np.inf]]))
+    kept, cost = better_of(memory, np.array([[5.0, 5.0, 5.0]]), x, np.array([[4.0, 5.0, np.inf]]))
     assert kept[0, :, 0].tolist() == [1.0, 20.0, 30.0]
     assert cost.tolist() == [[4.0, 5.0, 5.0]]
 
@@ -65,7 +66,7 @@ def test_the_swarm_moves_by_its_velocity_and_remembers():
         np.testing.assert_allclose(after.fx, problem.problem.cost(after.x), rtol=1e-12)
         np.testing.assert_array_equal(after.memory_cost, np.minimum(before.memory_cost, after.fx))
         column = int(after.memory_cost[0].argmin())
-        np.testing.assert_array_equal(after.leader[0, 0], after.memory[0, column])
+        np.testing.assert_array_equal(after.leader[0], after.memory[0, column])
     assert states[-1].memory_cost.min() < 0.1 * states[0].memory_cost.min()
 
 
