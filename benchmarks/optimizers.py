@@ -25,11 +25,11 @@ from rich.table import Table
 from accelcal_cli.optimizers.base import OPTIMIZERS
 from accelcal_cli.optimizers.minimize import minimize
 from accelcal_cli.streams import Float
-from benchmarks.functions import FUNCTIONS, TestFunction
+from accelcal_cli.studies.functions import PAPER, TestFunction
 
 POPULATION, ITERATIONS, D = 100, 500, 12
 PSO = {"w": 0.7298, "c1": 1.49618, "c2": 1.49618}
-OURS = [(name, runs) for name in ("pso", "de", "de-pso") for runs in (1, 20)]
+OURS = [(name, runs) for name in ("pso", "de", "de-pso", "shade-cma") for runs in (1, 20)]
 
 Job = Callable[[], object]
 """One whole search. The points it asked for are counted by its Objective, or else it returns their number."""
@@ -57,7 +57,10 @@ class Objective:
 
 
 def accelcal(objective: Objective, name: str, runs: int) -> Job:
-    optimizer = OPTIMIZERS.get(name)(population=POPULATION, iterations=ITERATIONS)
+    budget = {"population": POPULATION, "iterations": ITERATIONS}
+    if name == "shade-cma":  # its population is a schedule; the evaluations are the same
+        budget = {"evaluations": POPULATION * ITERATIONS}
+    optimizer = OPTIMIZERS.get(name)(**budget)
     return lambda: int(minimize(objective.problem, optimizer, runs=runs).evaluations.sum())
 
 
@@ -151,6 +154,7 @@ def pygmo_native(objective: Objective, name: str) -> Job:
     method = {
         "pso": pygmo.pso(gen=ITERATIONS),
         "de": pygmo.de(gen=ITERATIONS, ftol=0.0, xtol=0.0),
+        "cmaes": pygmo.cmaes(gen=ITERATIONS, ftol=0.0, xtol=0.0, force_bounds=True),
     }[name]
 
     def run() -> int:
@@ -170,6 +174,7 @@ PEERS: dict[str, Callable[[Objective], Job]] = {
     "pygmo pso_gen, numpy objective": pygmo_batch,
     "pygmo pso, all C++": partial(pygmo_native, name="pso"),
     "pygmo de, all C++": partial(pygmo_native, name="de"),
+    "pygmo cmaes, all C++": partial(pygmo_native, name="cmaes"),
 }
 
 
@@ -200,11 +205,11 @@ def measure(problem: TestFunction, repeat: int, console: Console) -> dict[str, f
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--func", choices=sorted(FUNCTIONS), default="rosenbrock")
+    parser.add_argument("--func", choices=PAPER, default="rosenbrock")
     parser.add_argument("--repeat", type=int, default=7)
     options = parser.parse_args()
     console = Console(width=120)
-    rates = measure(FUNCTIONS[options.func](D), options.repeat, console)
+    rates = measure(TestFunction(options.func, D), options.repeat, console)
     ours = [f"{name} x {runs}" for name, runs in OURS]
     table = Table("", "M eval/s", *ours, title=f"{options.func}: ours (x runs), and ours / theirs")
     table.add_row("accelcal", "", *(f"{rates[name]:.2f}" for name in ours), end_section=True)
