@@ -12,10 +12,17 @@ import numpy as np
 from accelcal_cli.calibration.lotters import Loetters, pack
 from accelcal_cli.calibration.search import polish
 from accelcal_cli.optimizers.minimize import Run, Stopping, minimize
-from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.units import ARCSEC, MICRO_G, PPM
 from accelcal_cli.streams import Float
-from accelcal_cli.studies.scene import Recording, Scene, Search, Simulation, recorded, simulated, starting_points
+from accelcal_cli.studies.scene import (
+    Recording,
+    Scene,
+    Search,
+    Simulation,
+    recorded,
+    simulated,
+    starting_points,
+)
 from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of
 from accelcal_cli.table import Column, Table
 

@@ -11,6 +11,7 @@ import numpy as np
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.registry import build
+from accelcal_cli.streams import Float
 from accelcal_cli.studies import benchmark, compare
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison
@@ -19,7 +20,6 @@ from accelcal_cli.studies.parts import Parts
 from accelcal_cli.studies.scene import Search, Simulation
 from accelcal_cli.studies.study import Entry, Record
 from accelcal_cli.table import Column, Table
-from accelcal_cli.streams import Float
 
 STUDY_KIND = "studies"
 KEYS = ("function", "optimizer")
