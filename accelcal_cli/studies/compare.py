@@ -98,7 +98,9 @@ class Comparison(Study):
             if self.polish:
                 run = _polished(scene.problem, run)
             seconds = time.perf_counter() - begin
-            return records_of(task, run, limit(scene.least, self.tolerance), seconds, self._values(scene, run))
+            return records_of(
+                task, run, limit(scene.least, self.tolerance), seconds, self._values(scene, run)
+            )
 
     def _values(self, scene: Scene, run: Run) -> list[dict[str, float | None]]:
         """Return errors, estimates and the least cost of each run."""
@@ -257,7 +259,9 @@ def _total(records: Sequence[Record], name: str) -> float | None:
 
 def _missed(rows: Sequence[Sequence[Any]]) -> list[str]:
     """Return a sentence for each optimizer that did not always come to the least cost of noisy readings."""
-    rate, excess = (next(i for i, c in enumerate(COLUMNS) if c.name == name) for name in ("success", "excess"))
+    rate, excess = (
+        next(i for i, c in enumerate(COLUMNS) if c.name == name) for name in ("success", "excess")
+    )
     return [
         f"{row[0]} came within 1 % of the least cost in {row[rate]:.0%} of its runs; its median run is "
         f"{'within 1 %' if row[excess] <= WITHIN else f'{1.0 + row[excess]:.3g} times as high'}."

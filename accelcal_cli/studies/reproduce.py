@@ -175,7 +175,9 @@ def _tables(part: Part, records: Sequence[Record]) -> list[Table]:
 
 
 def _summary(study: Benchmark | Comparison, records: Sequence[Record]) -> Table:
-    module = benchmark.summary(study, records) if isinstance(study, Benchmark) else compare.summary(study, records)
+    module = (
+        benchmark.summary(study, records) if isinstance(study, Benchmark) else compare.summary(study, records)
+    )
     return replace(module, title="")
 
 
@@ -230,6 +232,4 @@ def checkpoints(curves: Curves) -> Table:
         values = [float(cost[i]) if i >= 0 else None for i in index]
         rows.append((*([name] if name else []), label, *values))
     keys = (Column("function"),) if any(name for name, _, _ in panels) else ()
-    return Table(
-        "median cost after so many evaluations", (*keys, Column("optimizer"), *columns), tuple(rows)
-    )
+    return Table("median cost after so many evaluations", (*keys, Column("optimizer"), *columns), tuple(rows))

@@ -48,7 +48,9 @@ class Simulation:
     def __post_init__(self) -> None:
         """Refuse poses that cannot determine nine parameters, and noise that is none."""
         if self.positions < FEWEST:
-            raise ConfigError(f"positions: {self.positions} is too few; nine parameters need at least {FEWEST}")
+            raise ConfigError(
+                f"positions: {self.positions} is too few; nine parameters need at least {FEWEST}"
+            )
         if not (np.isfinite(self.noise) and self.noise >= 0):
             raise ConfigError(f"noise: {self.noise:g}: expected zero or more, in m/s^2")
 
@@ -76,7 +78,9 @@ class Recording:
                 f"{readings.source}: {readings.poses} poses; nine parameters need at least {FEWEST}, better 12 or more"
             )
         if not (readings.upper > readings.lower).any():
-            raise DataError(f"{readings.source}: all readings are equal; expected poses that differ in attitude")
+            raise DataError(
+                f"{readings.source}: all readings are equal; expected poses that differ in attitude"
+            )
         centre = 0.5 * (readings.lower + readings.upper)
         scale = 0.5 * float((readings.upper - readings.lower).max())
         packed = compress(((block, None) for _, block in readings.blocks()), centre, scale)
@@ -156,7 +160,9 @@ def recorded(source: Recording, space: Search, runs: Sequence[int], seed: int) -
     return Scene(problem, truth, found.cost, _information(triangle, space.g, truth))
 
 
-def starting_points(scene: Scene, space: Search, population: int, runs: Sequence[int], seed: int) -> Float | None:
+def starting_points(
+    scene: Scene, space: Search, population: int, runs: Sequence[int], seed: int
+) -> Float | None:
     """Return starting points in box coordinates, shape (R, P, D), or None for the box itself."""
     if space.start is None:
         return None
