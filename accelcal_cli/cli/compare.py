@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -183,8 +184,8 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     else:
         from accelcal_cli.output.study import show_study
 
-        plotted: dict[str, Any] = {"Comparison": found} if (found := curves(study, records)) else {}
-        show_study(study.title, [rows.filled()], plotted)
+        plotted: dict[str, Any] = {"Convergence": found} if (found := curves(study, records)) else {}
+        show_study(study.subject, [replace(rows.filled(), title="")], plotted, study.conditions)
     sys.stdout.flush()
 
 
@@ -192,4 +193,5 @@ def _plot(study: Comparison, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
     from accelcal_cli.studies.compare import curves
 
-    plot_convergence(study.title, {"": curves(study, records)}, study.tolerance, path)
+    tolerance = 0.0 if study.noisy else study.tolerance
+    plot_convergence(study.subject, {study.conditions: curves(study, records)}, tolerance, path)

@@ -68,13 +68,24 @@ class Comparison(Study):
         return {"optimizer": self.entries[cell].label}
 
     @property
-    def title(self) -> str:
-        """What is run, in a line."""
-        what = f"g = {self.space.g:g}, {self.space.unknowns} unknowns, {self.repeats} runs, seed {self.seed}"
+    def noisy(self) -> bool:
+        """Whether the least cost is above zero."""
+        return isinstance(self.source, Recording) or self.source.noise > 0
+
+    @property
+    def subject(self) -> str:
+        """Whose readings they are."""
         if isinstance(self.source, Recording):
-            return f"{self.source.source}: {self.source.poses} poses, {what}"
-        sensors = f"sensors {'drawn from' if self.source.drawn else 'all'} {self.source.sensor.name}"
-        return f"{sensors}, {self.source.positions} poses, noise {self.source.noise:g} m/s^2, {what}"
+            return self.source.source
+        return f"{'Sensors drawn from' if self.source.drawn else 'Always the same'} {self.source.sensor.name}"
+
+    @property
+    def conditions(self) -> str:
+        """What is run, in a line."""
+        space = f"g = {self.space.g:g}, {self.space.unknowns} unknowns, {self.repeats} runs, seed {self.seed}"
+        if isinstance(self.source, Recording):
+            return f"{self.source.poses} poses, {space}"
+        return f"{self.source.positions} poses, noise {self.source.noise:g} m/s^2, {space}"
 
     def scene(self, runs: Sequence[int]) -> Scene:
         """Return the calibrations of the runs of these numbers."""

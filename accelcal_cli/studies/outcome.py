@@ -49,7 +49,7 @@ def _row(study: Comparison, own: Sequence[Record], only_successful: bool) -> tup
         _count([r.evaluations for r in judged]),
         _count(hits),
         _median([r.cost for r in judged]),
-        _median([_excess(r) for r in judged]) if _noisy(study) else None,
+        _median([_excess(r) for r in judged]) if study.noisy else None,
         *(_total(judged, name) for name in ERRORS),
         _total(judged, "efficiency"),
     )
@@ -59,10 +59,6 @@ def _excess(record: Record) -> float:
     """Return the part by which a run's cost is above the least cost; what is only rounding is zero."""
     excess = record.cost / (record.values["least_cost"] or np.nan) - 1.0
     return 0.0 if abs(excess) < ROUNDING else excess
-
-
-def _noisy(study: Comparison) -> bool:
-    return isinstance(study.source, Recording) or study.source.noise > 0
 
 
 def _median(values: Sequence[float]) -> float | None:
