@@ -26,7 +26,7 @@ demo: $(VENV)/installed
 	$(BIN)/accelcal calibrate docs/sample.csv --g 9.80665
 
 test: $(VENV)/installed-test
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto $(ARGS)
 
 lint: $(VENV)/installed-lint
 	$(BIN)/ruff check .

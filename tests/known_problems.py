@@ -130,6 +130,22 @@ class Watched(Problem):
         return Watched(self.problem.take(index), self.seen)
 
 
+class WatchedCurvature(Watched):
+    """A Watched problem that knows its own gradient and Hessian."""
+
+    def gradient_hessian(self, x):
+        return self.problem.gradient_hessian(self._note(x))
+
+    def take(self, index):
+        return WatchedCurvature(self.problem.take(index), self.seen)
+
+
+def watched(problem):
+    """The problem, recording every point that it is evaluated at."""
+    own = type(problem).gradient_hessian is not Problem.gradient_hessian
+    return (WatchedCurvature if own else Watched)(problem)
+
+
 class Holed(Watched):
     """A problem whose cost and residuals are NaN in a part of the box along the first coordinate."""
 

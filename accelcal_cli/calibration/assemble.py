@@ -26,6 +26,9 @@ COMFORTABLE = 5.0
 """Suggested poses bring every dilution of precision to this: half of what counts as weak."""
 
 MOST_SUGGESTIONS = 8
+FEWEST_POSES = 12
+"""Suggested poses bring a poor set to at least this many: nine fit exactly and say nothing of their noise."""
+
 NOISE_BIAS = 3.0
 """Isotropic noise of standard deviation s makes scale factors too large by about 3 (s/g)^2: |f|^2 grows by 3 s^2
 on average, and the noise in the products of outputs doubles it. Measured at s/g from 0.02 to 0.1."""
@@ -56,7 +59,7 @@ def assemble(
     covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
     sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
     said, seen_first = _first_sight(solution, start, information, seen, readings.poses)
-    suggestions = _suggest(said, seen_first)
+    suggestions = _suggest(said, seen_first, readings.poses)
     scale_sigma = float(np.sqrt(np.diagonal(covariance)[quality.SCALE]).max()) / g
     ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
     return Calibration(
@@ -138,11 +141,11 @@ def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], 
     return lambda e: loss_weight(e / noise, settings.robust)
 
 
-def _suggest(information: Float, seen: Observability) -> tuple[str, ...]:
+def _suggest(information: Float, seen: Observability, poses: int) -> tuple[str, ...]:
     if seen.verdict == "good":
         return ()
     candidates = fixture_directions()
-    chosen = next_poses(information, candidates, MOST_SUGGESTIONS, COMFORTABLE)
+    chosen = next_poses(information, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
     return tuple(describe(candidates[i]) for i in chosen)
 
 
@@ -248,9 +251,13 @@ def _reasons(
 ) -> tuple[str, ...]:
     lines = list(quality.in_words(seen, suggestions))
     if freedom < 0:
-        lines.insert(0, f"{9 + freedom} poses are fewer than the nine parameters; take at least 12.")
+        lines.insert(
+            0, f"{9 + freedom} poses are fewer than the nine parameters; take at least {FEWEST_POSES}."
+        )
     if freedom == 0:
-        lines.append("Nine poses fit exactly and say nothing of their noise: no sigma. Take at least 12.")
+        lines.append(
+            f"Nine poses fit exactly and say nothing of their noise: no sigma. Take at least {FEWEST_POSES}."
+        )
     if edge:
         lines.append(
             f"The least cost lies outside the search box, beyond {', '.join(edge)}: "

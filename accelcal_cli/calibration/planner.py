@@ -14,14 +14,16 @@ def fixture_directions() -> Float:
     return np.concatenate([faces(), edges(), corners()])
 
 
-def next_poses(information: Float, candidates: Float, count: int, enough: float = 0.0) -> list[int]:
+def next_poses(
+    information: Float, candidates: Float, count: int, enough: float = 0.0, least: int = 0
+) -> list[int]:
     """Return the indices of up to `count` candidates, greedily chosen, best first.
 
     Args:
         information: J^T J of the poses so far, shape (9, 9); zeros when there are none.
         candidates: unit directions to choose from, shape (C, 3); one may be chosen again.
         count: how many to choose.
-        enough: stop when the worst dilution of precision is at or below this.
+        enough: stop when the worst dilution of precision is at or below this, but not before `least` are chosen.
 
     Each choice minimises the largest variance after it; the variances after a candidate a follow from the
     rank-one update P - P a a^T P / (1 + a^T P a). Ties go to the smallest sum of variances.
@@ -29,7 +31,7 @@ def next_poses(information: Float, candidates: Float, count: int, enough: float 
     rows = design(candidates)
     cofactor = np.linalg.inv(information + PRIOR * np.eye(9))
     chosen: list[int] = []
-    while len(chosen) < count and np.diagonal(cofactor).max() > enough**2:
+    while len(chosen) < count and (len(chosen) < least or np.diagonal(cofactor).max() > enough**2):
         gain = rows @ cofactor
         drop = gain**2 / (1.0 + np.einsum("cp,cp->c", gain, rows))[:, None]
         after = np.diagonal(cofactor) - drop

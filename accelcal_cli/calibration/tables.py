@@ -71,9 +71,12 @@ def engineering(result: Calibration) -> Table:
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
     sigma = np.sqrt(np.diagonal(result.covariance))
-    scale = units.scale_error(result.K_a, result.nominal_scale)
-    angle = units.misalignment(result.K_a)
-    bias = units.bias_force(result.K_a, result.D_a - result.nominal_bias)
+    # In gauge lower, as their sigma: another gauge, above all the free rotation of gauge full, moves a scale factor
+    # by half the square of the misalignments, which is many times that sigma.
+    K = result.model.in_gauge("lower").K
+    scale = units.scale_error(K, result.nominal_scale)
+    angle = units.misalignment(K)
+    bias = units.bias_force(K, result.D_a - result.nominal_bias)
     lost = _lost(result)
     sigma = np.where(lost, np.nan, sigma)
     rows = [_row(f"scale factor error {AXES[i]}", scale[i], sigma[i] / per_g, "ppm", "%") for i in range(3)]

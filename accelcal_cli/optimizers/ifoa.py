@@ -66,7 +66,7 @@ class ImprovedFruitFly(Optimizer):
     def init(self, problem: Problem, x: Float, rng: Streams) -> FlyState:
         """Start at the first point; the costs of all of them give the threshold when none is stated."""
         fx = problem.cost(x)
-        threshold = np.median(fx, axis=1) if self.threshold is None else np.full(len(x), self.threshold)
+        threshold = _middle(fx) if self.threshold is None else np.full(len(x), self.threshold)
         return FlyState(x, fx, x[:, :1], fx[:, 0], threshold)
 
     def step(self, problem: Problem, state: FlyState, rng: Streams) -> FlyState:
@@ -100,3 +100,11 @@ class ImprovedFruitFly(Optimizer):
         scale = np.array(self.radius_scale)[np.minimum(problem.groups, len(self.radius_scale) - 1)]
         reach: Float = (first * scale / units)[:, None, :]
         return reach
+
+
+def _middle(fx: Float) -> Float:
+    """Return the median cost of each run, shape (R,); a point without a cost counts as the worst that has one."""
+    finite = np.isfinite(fx)
+    worst = np.where(finite, fx, 0.0).max(axis=1, keepdims=True)
+    middle: Float = np.median(np.where(finite, fx, worst), axis=1)
+    return middle

@@ -53,6 +53,7 @@ class RowStore:
                 yield start, whole[start : start + rows]
             return
         for start in range(0, self.rows, rows):
+            self._settle()  # a writer that came between two blocks moves the file's position
             block = np.empty((min(rows, self.rows - start), self.width))
             with _named_disk_errors():
                 self._file.seek(start * self.width * 8)

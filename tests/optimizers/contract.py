@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from known_problems import CASES, Holed, Watched
+from known_problems import CASES, Holed, watched
 
 from accelcal_cli.optimizers.minimize import Status, Stopping, minimize
 
@@ -25,7 +25,8 @@ BUDGETS: Mapping[str, Mapping[str, Any]] = {
     "full-foa": {"iterations": 2000},
     "ifoa": {"iterations": 3000},
     "kpso": {"iterations": 200},
-    "shade-cma": {"evaluations": 12_000, "iterations": 2000},
+    "newton": {"population": 20},
+    "shade-cma": {"evaluations": 12_000, "iterations": 600},
 }
 """Settings by optimizer where the defaults are too large, or too small, for these small problems."""
 
@@ -36,7 +37,7 @@ SHORT: Mapping[str, Mapping[str, Any]] = {
 
 REACHED: Mapping[str, Mapping[str, float]] = {
     "foa": {"rosenbrock": 0.12},
-    "full-foa": {"sphere": 0.08, "rosenbrock": 0.1, "residuals": 6e-3, "calibration": 0.5},
+    "full-foa": {"sphere": 0.08, "rosenbrock": 0.1, "residuals": 4e-3, "calibration": 0.5},
     "kpso": {"sphere": 0.06, "rosenbrock": 0.08, "residuals": 1.2e-3, "calibration": 0.2},
 }
 """A weaker cost that counts as reached, by optimizer and case: swarms with a radius or a noise that never shrinks
@@ -44,9 +45,6 @@ stay on a floor. It is still several times below what random search finds."""
 
 BEYOND: Mapping[str, tuple[str, ...]] = {"foa": ("sphere", "residuals", "calibration")}
 """Minima that an algorithm as published cannot reach (FOA's candidates are positive and near its swarm's radius)."""
-
-MAY_FAIL = ("newton",)
-"""Algorithms that diverge from many starting points: one run in three has to arrive, not two."""
 
 
 def build(cls):
@@ -63,8 +61,7 @@ def short(cls):
 
 def arrived(cls, cost, case):
     """Whether enough runs have reached the minimum: two of three, so that one may be trapped."""
-    share = 1 / 3 if cls.name in MAY_FAIL else 2 / 3
-    return (cost <= reached(cls, case)).mean() >= share - 1e-9
+    return len(cost) > 0 and (cost <= reached(cls, case)).mean() >= 0.6
 
 
 def searches(cls):
@@ -104,7 +101,7 @@ def never_worsens(cls, case):
 
 
 def keeps_to_the_box(cls, case):
-    problem = Watched(CASES[case].make())
+    problem = watched(CASES[case].make())
     minimize(problem, short(cls), runs=RUNS, seed=7)
     points = problem.seen.all()
     assert len(points) >= RUNS
@@ -113,10 +110,10 @@ def keeps_to_the_box(cls, case):
 
 
 def counts_every_evaluation(cls, case):
-    problem = Watched(CASES[case].make())
+    problem = watched(CASES[case].make())
     run = minimize(problem, short(cls), runs=1, seed=8)
     assert problem.seen.evaluations == run.evaluations[0] > 0
-    many = Watched(CASES[case].make())
+    many = watched(CASES[case].make())
     batch = minimize(many, short(cls), runs=3, seed=8)
     assert many.seen.evaluations == batch.evaluations.sum()
     assert batch.evaluations[0] == run.evaluations[0]
@@ -141,7 +138,7 @@ def alone_equals_batch(cls, case):
 
 def a_seed_repeats(cls, case):
     def points(seed):
-        problem = Watched(CASES[case].make())
+        problem = watched(CASES[case].make())
         minimize(problem, short(cls), runs=2, seed=seed)
         return problem.seen.all().tobytes()
 
@@ -159,7 +156,7 @@ def survives_nan(cls, case):
         assert well != (status is Status.FAILED)
     assert (run.x[alive, 0] >= problem.edge).all()
     if case not in BEYOND.get(cls.name, ()):
-        assert (run.cost[alive] <= reached(cls, case)).any(), f"{case}: best costs {run.cost}"
+        assert arrived(cls, run.cost[alive], case), f"{case}: best costs {run.cost}"
     # A population of many has points outside the hole, and has to find its way from them.
     assert alive.all() or build(cls).population == 1
     nowhere = minimize(Holed(CASES[case].make(), share=2.0), build(cls), runs=2, seed=13)
@@ -190,7 +187,8 @@ def stops_at_the_budget(cls, case):
     if not searches(cls):
         assert counts[-1] == 1
         return
-    for step in (1, 3):
+    assert len(counts) > 2
+    for step in (1, min(3, len(counts) - 2)):
         budget = int(counts[step - 1]) + 1
         run = minimize(problem, short(cls), runs=1, seed=15, stopping=Stopping(evaluations=budget))
         assert run.status == (Status.EVALUATIONS,)

@@ -60,7 +60,9 @@ def _disable(monkeypatch, cls, step):
 
 
 @pytest.mark.parametrize("step", [_unchanged, _same_point_again, _random_search])
-@pytest.mark.parametrize(("name", "case"), PAIRS)
+@pytest.mark.parametrize(
+    ("name", "case"), [(name, case) for name, case in PAIRS if case not in contract.BEYOND.get(name, ())]
+)
 def test_an_optimizer_without_its_update_does_not_reach_the_minimum(monkeypatch, name, case, step):
     cls = OPTIMIZERS.get(name)
     _disable(monkeypatch, cls, step)
@@ -121,7 +123,9 @@ def test_every_optimizer_ships_its_settings(name):
     assert record["source"]
     assert set(record["parameters"]) == {field.name for field in dataclasses.fields(cls)}
     built = OPTIMIZERS.build(name, record["parameters"], name)
-    assert dataclasses.asdict(built) == record["parameters"]
+    for key, stated in record["parameters"].items():
+        value = getattr(built, key)
+        assert (list(value) if isinstance(value, tuple) else value) == stated
     assert set(record) == {"optimizer", "source", "parameters"}
 
 
