@@ -7,7 +7,7 @@ and its box from its own streams, so that it is the same in any company.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from accelcal_cli.sensor.poses import directions
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, NOISE_PURPOSE, Sensor, draw
 from accelcal_cli.streams import Float, Streams
+
+START_PURPOSE = 6
+"""Stream of starting points outside the box."""
 
 FEWEST = 9
 """Poses that nine parameters need."""
@@ -108,7 +111,7 @@ class Search:
 
     g: float
     unknowns: int = 9
-    box: BoxSettings = BoxSettings()
+    box: BoxSettings = field(default_factory=BoxSettings)
     nominal: float | None = None
     start: BoxSettings | None = None
 
@@ -172,10 +175,6 @@ def starting_points(
     half = half_widths(scale, space.start, space.g, space.unknowns)
     u = 2.0 * Streams(seed, runs, purpose=START_PURPOSE).uniform(population, space.unknowns) - 1.0
     return (centre[:, None] + half[:, None] * u - box.centre[:, None]) / box.half[:, None]
-
-
-START_PURPOSE = 6
-"""Stream of starting points outside the box."""
 
 
 def _information(triangle: Triangle, g: float, truth: ErrorModel) -> Float:
