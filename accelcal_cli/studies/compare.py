@@ -100,14 +100,14 @@ class Comparison(Study):
             scene = self.scene(runs)
             optimizer = self.entries[task.cell].build()
             start = starting_points(scene, self.space, optimizer.population, runs, self.seed)
-            begin = time.perf_counter()
+            begin = time.thread_time()
             stopping = Stopping(self.tolerance if self.stop else None)
             run = minimize(
                 scene.problem, optimizer, runs=runs, seed=self.seed, stopping=stopping, start=start
             )
             if self.polish:
                 run = _polished(scene.problem, run)
-            seconds = time.perf_counter() - begin
+            seconds = time.thread_time() - begin
             return records_of(
                 task, run, limit(scene.least, self.tolerance), seconds, self._values(scene, run)
             )
