@@ -1,6 +1,6 @@
 """The documentation is true: its commands run and print what it says, and nothing is left out of it.
 
-`python tests/test_docs.py` writes the generated tables and the outputs into the pages anew, or into those that it is given.
+`python tests/test_docs.py [PAGE ...]` writes the generated tables and the outputs into the pages anew.
 """
 
 from __future__ import annotations
