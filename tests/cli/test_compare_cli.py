@@ -160,7 +160,8 @@ def test_reproduce_writes_raw_results_and_plots(run, tmp_path):
 
 COMPARE = {
     "too few positions": (["--positions", "3"], ["--positions 3", "at least 9 poses"]),
-    "negative noise": (["--noise", "-1"], ["--noise -1", "expected zero or more"]),
+    "negative noise": (["--noise", "-1"], ["--noise -1", "expected 0 to 100"]),
+    "too much noise": (["--noise", "1e9"], ["--noise 1e+09", "expected 0 to 100"]),
     "noise that is none": (["--noise", "nan"], ["--noise nan"]),
     "no runs": (["--runs", "0"], ["--runs", "0 is not in the range"]),
     "unknown sensor": (["--sensor", "mem"], ['"mem"', 'did you mean "mems"']),
