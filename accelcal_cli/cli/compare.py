@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from accelcal_cli.cli import options, running
+from accelcal_cli.cli.simulate import LARGEST_NOISE
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -74,7 +75,12 @@ def command(
     gauge: Annotated[str, typer.Option(help="What is searched: lower (9 unknowns) or full (12).")] = "lower",
     g: options.Gravity = None,
     polish: Annotated[
-        bool, typer.Option("--polish/--no-polish", help="Finish every search by Levenberg-Marquardt.")
+        bool,
+        typer.Option(
+            "--polish/--no-polish",
+            help="Finish every search by Levenberg-Marquardt.",
+            show_default="no-polish",
+        ),
     ] = False,
     tolerance: Annotated[
         float, typer.Option(help="A run succeeds within this of the least cost, (m/s^2)^4, or within 1 %.")
@@ -148,8 +154,8 @@ def _simulated(
 
     if columns is not None:
         raise UsageError("--columns: needs a file of readings")
-    if noise is not None and not (math.isfinite(noise) and noise >= 0):
-        raise UsageError(f"--noise {noise:g}: expected zero or more, in m/s^2")
+    if noise is not None and not 0 <= noise <= LARGEST_NOISE:
+        raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
     count = 12 if positions is None else positions
     if count < FEWEST:
         raise UsageError(f"--positions {count}: nine parameters need at least {FEWEST} poses")

@@ -74,15 +74,11 @@ class Recording:
         """Return readings as part of a study.
 
         Raises:
-            DataError: fewer than nine poses, or all readings are equal.
+            DataError: fewer than nine poses.
         """
         if readings.poses < FEWEST:
             raise DataError(
                 f"{readings.source}: {readings.poses} poses; nine parameters need at least {FEWEST}, better 12 or more"
-            )
-        if not (readings.upper > readings.lower).any():
-            raise DataError(
-                f"{readings.source}: all readings are equal; expected poses that differ in attitude"
             )
         centre = 0.5 * (readings.lower + readings.upper)
         scale = 0.5 * float((readings.upper - readings.lower).max())
