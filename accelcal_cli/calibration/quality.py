@@ -150,7 +150,9 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
     variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
     touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
     sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
-    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}.get(gauge, np.zeros((3, 3)))
+    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}.get(
+        gauge, np.zeros((3, 3))
+    )
     return np.where(exact, 0.0, sigma_K), sigma_D  # a zero of the gauge has no error
 
 
