@@ -29,10 +29,10 @@ def attitudes(u: Floats, n: NDArray[np.int64], angle: float) -> list[Indices]:
         Indices of each group, its longest pose first.
     """
     left = np.argsort(-n, kind="stable")
-    limit = 2.0 * np.sin(np.radians(angle) / 2.0)
+    limit = np.cos(np.radians(angle))
     groups = []
     while len(left):
-        near = np.linalg.norm(u[left] - u[left[0]], axis=1) <= limit  # the chord: exact for small angles
+        near = u[left] @ u[left[0]] >= limit
         near[0] = True
         groups.append(left[near])
         left = left[~near]

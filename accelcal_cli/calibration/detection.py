@@ -8,8 +8,7 @@ import numpy as np
 
 from accelcal_cli.calibration.attitudes import attitudes, directions_of
 from accelcal_cli.calibration.complaint import too_few
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.screening import screen
 from accelcal_cli.sensor.envelope import Envelope
 from accelcal_cli.sensor.intervals import Found, Intervals, find_intervals, merge
 from accelcal_cli.sensor.rawlog import RawLog
@@ -171,16 +170,15 @@ def _judge(found: Found, settings: DetectSettings) -> Candidate:
     seen = Candidate(found.multiplier, len(intervals), min(len(intervals), 1))
     if len(intervals) < 2 or not np.ptp(intervals.mean, axis=0).any():
         return seen
-    fit = Settings(optimizer="ellipsoid", g=settings.g, weights="auto")
-    result = calibrate(_readings(intervals, "log"), fit)
-    distinct = len(attitudes(directions_of(intervals.mean, result.model), intervals.n, DISTINCT))
-    sigma = result.s * result.dop.worst * np.sqrt(len(intervals) / distinct)
+    fit = screen(_readings(intervals, "log"), settings.g)
+    distinct = len(attitudes(directions_of(intervals.mean, fit.model), intervals.n, DISTINCT))
+    sigma = fit.s * fit.dop * np.sqrt(len(intervals) / distinct)
     return replace(
         seen,
         attitudes=distinct,
-        rms=result.rms,
+        rms=fit.rms,
         sigma=float(sigma) if np.isfinite(sigma) else float("inf"),
-        verdict=result.verdict,
+        verdict=fit.verdict,
     )
 
 
@@ -193,8 +191,7 @@ def _thinned(intervals: Intervals, settings: DetectSettings) -> Intervals:
     angle = settings.merge if settings.merge is not None else settings.thin
     if angle is None:
         return intervals
-    fit = Settings(optimizer="ellipsoid", g=settings.g)
-    model = calibrate(_readings(intervals, "log"), fit).model
+    model = screen(_readings(intervals, "log"), settings.g).model
     groups = attitudes(directions_of(intervals.mean, model), intervals.n, angle)
     if settings.merge is None:
         return intervals.take(np.sort(np.array([group[0] for group in groups])))

@@ -54,7 +54,8 @@ def shared_weights(readings: Readings, settings: Settings) -> Float | None:
         return None
     weights, before = None, -1.0
     for _ in range(ROUNDS):
-        errors, own = _errors(readings, _fitted(readings, settings, weights), settings.g)
+        problem, x = fitted(readings, settings, weights)
+        errors, own = _errors(readings, model_at(problem, x), settings.g)
         shared = shared_variance(errors, own, readings.poses - 9)
         shared = max(shared, LEAST * float(own.mean()))
         if not shared > 0 or abs(shared - before) <= SETTLED * shared:
@@ -86,13 +87,13 @@ def shared_variance(errors: Float, own: Float, freedom: int) -> float:
     return high
 
 
-def _fitted(readings: Readings, settings: Settings, weights: Float | None) -> ErrorModel:
-    """Return the sensor that fits the weighted readings, polished from the middle of its box."""
+def fitted(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Float]:
+    """Return the problem of the weighted readings and the point, shape (1, D), polished from the middle of its box."""
     centre = 0.5 * (readings.lower + readings.upper)
     scale = 0.5 * float((readings.upper - readings.lower).max())
     triangle = compress(weighted(readings, weights), centre, scale)
     problem = Loetters(triangle, settings.g, search_box(triangle, settings).box)
-    return model_at(problem, polish(problem, np.zeros_like(problem.box.centre)).x)
+    return problem, polish(problem, np.zeros_like(problem.box.centre)).x
 
 
 def _errors(readings: Readings, model: ErrorModel, g: float) -> tuple[Float, Float]:

@@ -87,7 +87,7 @@ def command(
     record = _truth(device, local_g, sigma, u)
     with whole_file(output) as file:
         if raw:
-            log = handled(device, u, local_g, build(Handling, handling, "--raw"), sigma, seed)
+            log = handled(device, u, local_g, build(Handling, handling, "simulate --raw"), sigma, seed)
             record["holds"] = [list(rows) for rows in write_log(log, gyro, file)]
         else:
             _write(file, simulate(device, u, local_g, samples, sigma, seed), samples > 1, attitude)

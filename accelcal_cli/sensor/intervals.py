@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from accelcal_cli.sensor.tiles import Tiles
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Moments = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Found:
     Attributes:
         multiplier: of the level.
         intervals: the still intervals that are long enough.
-        short: rows of those that are not, after trimming, shape (s,).
+        short: rows of those that are not, before trimming, shape (s,).
     """
 
     multiplier: float
@@ -73,14 +75,14 @@ class Found:
 
 def find_intervals(tiles: Tiles, rows: Rows, level: Level, multipliers: Sequence[float]) -> list[Found]:
     """Return the still intervals of a log for every multiplier of the level."""
-    found = []
     firsts, lasts = runs(tiles, rows, level, multipliers)
-    for multiplier, first, last in zip(multipliers, firsts, lasts, strict=True):
-        a, b = _trimmed(first, last, rows)
-        length = (b - a) * tiles.size
-        enough = length >= rows.least
-        intervals = _measure(tiles, a[enough], b[enough])
-        found.append(Found(multiplier, intervals, length[~enough]))
+    ends = [_trimmed(first, last, rows) for first, last in zip(firsts, lasts, strict=True)]
+    measured = Atoms.of(tiles, np.unique(np.concatenate([tile for pair in ends for tile in pair])))
+    found = []
+    for k, (a, b) in enumerate(ends):
+        enough = (b - a) * tiles.size >= rows.least
+        whole = (lasts[k] - firsts[k] + rows.width) * tiles.size
+        found.append(Found(multipliers[k], measured.intervals(a[enough], b[enough]), whole[~enough]))
     return found
 
 
@@ -98,43 +100,65 @@ def _trimmed(first: Ints, last: Ints, rows: Rows) -> tuple[Ints, Ints]:
     return a, np.maximum(a, b)
 
 
-def _measure(tiles: Tiles, a: Ints, b: Ints) -> Intervals:
-    """Return the intervals of tiles a to b - 1, each shape (I,), read from the tiles in one pass."""
-    count, mean, square = np.zeros(len(a)), np.zeros((len(a), 3)), np.zeros((len(a), 3))
-    time = np.full((len(a), 2), np.nan)
-    for first, block in tiles.blocks():
-        low, high = np.clip(a - first, 0, len(block)), np.clip(b - first, 0, len(block))
-        here = np.flatnonzero(high > low)
-        if not len(here):
-            continue
-        part = _sums(block[:, :6], low[here], high[here], tiles.size)
-        count[here], mean[here], square[here] = _joined((count[here], mean[here], square[here]), part)
-        if tiles.timed:
-            begins = a[here] >= first
-            time[here[begins], 0] = block[low[here[begins]], -2]
-            time[here, 1] = block[high[here] - 1, -1]
-    n = count.astype(np.int64)
-    scatter = np.sqrt(square / np.maximum(n - 1, 1)[:, None])
-    return Intervals(a * tiles.size + 1, b * tiles.size, n, mean, scatter, time if tiles.timed else None)
+@dataclass(frozen=True)
+class Atoms:
+    """Stretches of tiles between all ends of intervals that any multiplier gives, each measured once.
+
+    Attributes:
+        tile: rows of a tile; edge: first tile of each atom, and the end of the last, shape (A + 1,).
+        moments: rows, mean and squares about it of each atom, shapes (A,), (A, 3), (A, 3).
+        time: of the first and last row of each atom, shape (A, 2), or None.
+    """
+
+    tile: int
+    edge: Ints
+    moments: Moments
+    time: Floats | None
+
+    @classmethod
+    def of(cls, tiles: Tiles, edge: Ints) -> Self:
+        """Read the tiles between the edges, in one pass."""
+        a, b = edge[:-1], edge[1:]
+        count, mean, square = np.zeros(len(a)), np.zeros((len(a), 3)), np.zeros((len(a), 3))
+        time = np.full((len(a), 2), np.nan)
+        for first, block in tiles.blocks():
+            low, high = np.clip(a - first, 0, len(block)), np.clip(b - first, 0, len(block))
+            here = np.flatnonzero(high > low)
+            if not len(here):
+                continue
+            rows = np.full(len(block), float(tiles.size))
+            part = _together((rows, block[:, :3], block[:, 3:6]), low[here], high[here])
+            count[here], mean[here], square[here] = _joined((count[here], mean[here], square[here]), part)
+            if tiles.timed:
+                begins = here[a[here] >= first]
+                time[begins, 0] = block[low[begins], -2]
+                time[here, 1] = block[high[here] - 1, -1]
+        return cls(tiles.size, edge, (count, mean, square), time if tiles.timed else None)
+
+    def intervals(self, a: Ints, b: Ints) -> Intervals:
+        """Return the intervals of tiles a to b - 1, each shape (I,); a and b are edges."""
+        low, high = np.searchsorted(self.edge, a), np.searchsorted(self.edge, b)
+        count, mean, square = _together(self.moments, low, high)
+        scatter = np.sqrt(square / np.maximum(count - 1, 1)[:, None])
+        time = None if self.time is None else np.stack([self.time[low, 0], self.time[high - 1, 1]], axis=1)
+        return Intervals(a * self.tile + 1, b * self.tile, count.astype(np.int64), mean, scatter, time)
 
 
-Moments = tuple[Floats, Floats, Floats]
-
-
-def _sums(block: Floats, low: Ints, high: Ints, size: int) -> Moments:
-    """Return rows (I,), mean (I, 3) and squares about it (I, 3) of the tiles low to high - 1 of a block."""
-    tiles = high - low
-    begin = np.cumsum(tiles) - tiles
-    owner = np.repeat(np.arange(len(low)), tiles)
-    inside = block[np.arange(len(owner)) + (low - begin)[owner]]
-    centre: Floats = block[low, :3]  # about a tile of the interval itself the sums stay small
-    off = inside[:, :3] - centre[owner]
-    shift: Floats = np.add.reduceat(off, begin) / tiles[:, None]
-    between = np.add.reduceat((off - shift[owner]) ** 2, begin)
-    within: Floats = np.add.reduceat(inside[:, 3:], begin)
-    count: Floats = (tiles * size).astype(np.float64)
-    square: Floats = within + size * between
-    return count, centre + shift, square
+def _together(items: Moments, low: Ints, high: Ints) -> Moments:
+    """Return rows (I,), mean (I, 3) and squares about it (I, 3) of the items low to high - 1 taken together."""
+    number = high - low
+    if not len(number):
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+    begin = np.cumsum(number) - number
+    owner = np.repeat(np.arange(len(low)), number)
+    inside = np.arange(len(owner)) + (low - begin)[owner]
+    rows, square = items[0][inside], items[2][inside]
+    centre = items[1][low]  # about an item of the interval itself the sums stay small
+    off = items[1][inside] - centre[owner]
+    total: Floats = np.add.reduceat(rows, begin)
+    shift: Floats = np.add.reduceat(rows[:, None] * off, begin) / total[:, None]
+    off -= shift[owner]
+    return total, centre + shift, np.add.reduceat(square + rows[:, None] * off * off, begin)
 
 
 def _joined(one: Moments, two: Moments) -> Moments:

@@ -32,13 +32,18 @@ class RawRows:
     """A block of rows of a raw log.
 
     Attributes:
-        output: shape (B, 3), sensor units; gyro: shape (B, 3), as given, or None.
-        time: shape (B,), as given, or None.
+        numbers: acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, shape (B, k).
+        gyro, timed: which of them there are.
     """
 
-    output: Floats
-    gyro: Floats | None
-    time: Floats | None
+    numbers: Floats
+    gyro: bool = False
+    timed: bool = False
+
+    @property
+    def time(self) -> Floats | None:
+        """Time of each row, shape (B,), as given."""
+        return self.numbers[:, -1] if self.timed else None
 
 
 @dataclass(frozen=True)
@@ -117,7 +122,7 @@ class RawLog:
             raw = self._part(rows.numbers)
             if raw.time is not None and len(raw.time):
                 self._check_time(raw.time, last, rows.start)
-                last = raw.time[-1]
+                last = float(raw.time[-1])
             yield raw
             if not self._head:
                 self._head.extend(_first(self._rows, 1))
@@ -127,8 +132,9 @@ class RawLog:
         self._table.close()
 
     def _part(self, numbers: Floats) -> RawRows:
-        gyro = numbers[:, 3:6] if self.columns.gyro else None
-        return RawRows(numbers[:, :3], gyro, None if self.columns.time is None else numbers[:, -1])
+        sensors = 6 if self.columns.gyro else 3
+        timed = self.columns.time is not None
+        return RawRows(numbers[:, : sensors + timed], sensors == 6, timed)
 
     def _check_time(self, time: Floats, last: float, start: int) -> None:
         back = np.diff(time, prepend=last) < 0

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
@@ -31,8 +30,11 @@ STILL_POSES = 12
 ACCELEROMETER_QUIET = 2.0
 """Windows up to this multiple of the quietest variance tell how much a gyroscope turns at rest."""
 
-MOST_TURNING = 0.9
+MOST_TURNING = 0.75
 """Part of those windows that turn no more than the level."""
+
+ROUNDING = 1e-13
+"""A standard deviation below this part of the readings is rounding: a sensor without noise, or one that is stuck."""
 
 NOT_STILL = 100.0
 """A stated still period of more than this multiple of the quietest variance is not still."""
@@ -45,12 +47,14 @@ class Level:
     Attributes:
         variance: norm of the variances of the three axes, (sensor units)^2.
         quietest: the same of the quietest windows, where `variance` is that of a stated still period.
+        extent: half the range of the readings, the outermost hundredths left out, sensor units.
         turning: mean square of the turning rate about its bias, (gyroscope units)^2; inf without a gyroscope.
         bias: of the gyroscope, shape (3,).
     """
 
     variance: float
     quietest: float
+    extent: float
     turning: float
     bias: Floats
 
@@ -61,11 +65,12 @@ class Windows:
 
     Attributes:
         first: number of the first window, that of its first tile.
-        variance: norm of the variances, shape (B,); rate: mean of the gyroscope, shape (B, 3), spread: sum of its
-            variances, shape (B,).
+        mean: shape (B, 3); variance: norm of the variances, shape (B,).
+        rate: mean of the gyroscope, shape (B, 3); spread: sum of its variances, shape (B,).
     """
 
     first: int
+    mean: Floats
     variance: Floats
     rate: Floats
     spread: Floats
@@ -76,29 +81,31 @@ class Windows:
         return turning
 
 
-def windows(tiles: Tiles, width: int) -> Iterator[Windows]:
-    """Yield every window of `width` tiles, block by block."""
+def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
+    """Yield every `step`-th window of `width` tiles, block by block."""
     for first, block in tiles.blocks(overlap=width - 1):
         if len(block) < width:
             continue
-        _, variance = _window(block[:, :3], block[:, 3:6], tiles.size, width)
-        norm = np.sqrt(np.einsum("ij,ij->i", variance, variance))
-        rate, spread = np.zeros((len(norm), 3)), np.zeros(len(norm))
+        start = (-first) % step
+        take = slice(start, len(block) - width + 1, step)
+        mean, variance = _window(block[:, :6], tiles.size, width, take)
+        rate, spread = np.zeros_like(variance), np.zeros(variance.shape[1])
         if tiles.gyro:
-            rate, turned = _window(block[:, 6:9], block[:, 9:12], tiles.size, width)
-            spread = turned.sum(axis=1)
-        yield Windows(first, norm, rate, spread)
+            rate, turned = _window(block[:, 6:12], tiles.size, width, take)
+            spread = turned.sum(axis=0)
+        norm = np.sqrt(variance[0] ** 2 + variance[1] ** 2 + variance[2] ** 2)
+        yield Windows(first + start, mean.T, norm, rate.T, spread)
 
 
-def _window(mean: Floats, square: Floats, size: int, width: int) -> tuple[Floats, Floats]:
-    """Return mean and variance, each (B - width + 1, 3), of all windows of `width` tiles."""
-    means = sliding_window_view(mean, width, axis=0)
-    centre = means.sum(axis=-1) / width
-    between = np.zeros_like(centre)
-    for k in range(width):
-        between += (means[..., k] - centre) ** 2
-    within = sliding_window_view(square, width, axis=0).sum(axis=-1)
-    return centre, (within + size * between) / (size * width)
+def _window(moments: Floats, size: int, width: int, take: slice) -> tuple[Floats, Floats]:
+    """Return mean and variance, each (3, windows), of the windows of `width` tiles that begin at `take`."""
+    parts = [moments[take.start + k : take.stop + k : take.step].T.copy() for k in range(width)]
+    centre: Floats = np.add.reduce([part[:3] for part in parts]) / width
+    square = np.zeros_like(centre)
+    for part in parts:
+        off = part[:3] - centre
+        square += part[3:] + size * off * off
+    return centre, square / (size * width)
 
 
 def find_level(tiles: Tiles, rows: Rows, name: str) -> Level:
@@ -114,8 +121,9 @@ def find_level(tiles: Tiles, rows: Rows, name: str) -> Level:
     count = tiles.count - rows.width + 1
     if count < 1:
         raise DataError(f"{name}: has {tiles.rows:,} rows, fewer than one window of {rows.window:,}")
-    variance, rate, spread = _sampled(tiles, rows.width, -(-count // SAMPLE))
-    noisy = variance > 0
+    sample = list(windows(tiles, rows.width, -(-count // SAMPLE)))
+    mean, variance = np.concatenate([w.mean for w in sample]), np.concatenate([w.variance for w in sample])
+    noisy = variance > (ROUNDING * float(np.abs(mean).max())) ** 2
     if not noisy.any():
         raise DataError(
             f"{name}: all readings are equal, or change only in steps; the sensor has to be turned"
@@ -123,23 +131,19 @@ def find_level(tiles: Tiles, rows: Rows, name: str) -> Level:
     part = np.clip(STILL_POSES * rows.least / tiles.rows, FEWEST_QUIET, MOST_QUIET)
     quietest = float(np.quantile(variance[noisy], part))
     level = quietest if rows.still is None else _still_period(tiles, rows, quietest, name)
+    extent = 0.5 * float(np.ptp(np.quantile(mean, [0.01, 0.99], axis=0), axis=0).max())
     turning, bias = np.inf, np.zeros(3)
     if tiles.gyro:
-        calm = variance <= ACCELEROMETER_QUIET * quietest
-        bias = np.median(rate[calm], axis=0)
-        square = spread[calm] + ((rate[calm] - bias) ** 2).sum(axis=1)
-        turning = float(np.quantile(square, MOST_TURNING))
-    return Level(level, quietest, turning, bias)
+        turning, bias = _turning(sample, variance <= ACCELEROMETER_QUIET * quietest)
+    return Level(level, quietest, extent, turning, bias)
 
 
-def _sampled(tiles: Tiles, width: int, step: int) -> tuple[Floats, Floats, Floats]:
-    """Return variance, rate and spread of every `step`-th window."""
-    parts = []
-    for block in windows(tiles, width):
-        take = slice((-block.first) % step, None, step)
-        parts.append((block.variance[take], block.rate[take], block.spread[take]))
-    variance, rate, spread = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return variance, rate, spread
+def _turning(sample: Sequence[Windows], calm: NDArray[np.bool_]) -> tuple[float, Floats]:
+    """Return the level of the gyroscope and its bias, from the windows that the accelerometer calls calm."""
+    rate = np.concatenate([w.rate for w in sample])[calm]
+    bias: Floats = np.median(rate, axis=0)
+    square = np.concatenate([w.turning(bias) for w in sample])[calm]
+    return float(np.quantile(square, MOST_TURNING)), bias
 
 
 def _still_period(tiles: Tiles, rows: Rows, quietest: float, name: str) -> float:

@@ -48,9 +48,7 @@ class Tiles:
 
     def add(self, raw: RawRows, envelope: Envelope | None = None) -> None:
         """Take in the next rows; an `envelope` sees them too."""
-        columns = [*raw.output.T, *(() if raw.gyro is None else raw.gyro.T)]
-        columns += [] if raw.time is None else [raw.time]
-        block = np.stack(columns)  # (k, B): one column after the other
+        block = np.ascontiguousarray(raw.numbers.T)  # (k, B): one column after the other
         self.rows += block.shape[1]
         if self._rest is not None and self._rest.shape[1]:
             need = self.size - self._rest.shape[1]
