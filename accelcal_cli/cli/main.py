@@ -11,7 +11,7 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import benchmark, calibrate, compare, optimizers, reproduce, simulate
+from accelcal_cli.cli import benchmark, calibrate, compare, detect, optimizers, reproduce, simulate
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -46,6 +46,7 @@ app = typer.Typer(
 )
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
+app.command("detect")(detect.command)
 app.command("benchmark")(benchmark.command)
 app.command("compare")(compare.command)
 app.command("reproduce")(reproduce.command)
