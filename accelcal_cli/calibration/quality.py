@@ -133,6 +133,19 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
         gauge: `lower`, `upper` or `symmetric`; in `full` the off-diagonals are not observable one by one and
             come out as NaN.
         g: local gravity, m/s^2.
+    """
+    chain = gauge_chain(K, K_lower, gauge, g)
+    lost = np.isnan(np.diagonal(covariance)[:6])
+    variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
+    touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
+    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
+    if gauge == "full":
+        sigma_K = np.where(np.eye(3) > 0, sigma_K, np.nan)
+    return sigma_K, np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+
+
+def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
+    """Return d K / d parameters, shape (9, 6): the entries of K_a in a gauge by the first six of the nine parameters.
 
     A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
     small rotation W (skew) is the one that keeps K in its gauge: three linear conditions.
@@ -152,14 +165,7 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
             angle = np.linalg.solve(turns, -_conditions(change, gauge))
             change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
         columns.append(change.ravel())
-    chain = np.stack(columns, axis=1)
-    lost = np.isnan(np.diagonal(covariance)[:6])
-    variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
-    touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
-    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
-    if gauge == "full":
-        sigma_K = np.where(np.eye(3) > 0, sigma_K, np.nan)
-    return sigma_K, np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+    return np.stack(columns, axis=1)
 
 
 def _conditions(change: Float, gauge: str) -> Float:
