@@ -11,7 +11,18 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import benchmark, calibrate, compare, detect, optimizers, reproduce, simulate
+from accelcal_cli.cli import (
+    apply,
+    benchmark,
+    calibrate,
+    compare,
+    detect,
+    export,
+    optimizers,
+    reproduce,
+    simulate,
+    verify,
+)
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -47,6 +58,9 @@ app = typer.Typer(
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
 app.command("detect")(detect.command)
+app.command("apply")(apply.command)
+app.command("export")(export.command)
+app.command("verify")(verify.command)
 app.command("benchmark")(benchmark.command)
 app.command("compare")(compare.command)
 app.command("reproduce")(reproduce.command)
