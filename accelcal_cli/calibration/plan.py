@@ -66,12 +66,12 @@ def pose_table(found: Plan) -> Table:
     """Return one row a pose: how to hold the sensor, and the worst of each kind expected after it."""
     rows = [_pose_row(found, k) for k in range(len(found.seen))]
     columns = [Column("pose", format="d"), Column("hold")]
-    columns += [Column(axis, format=".4f") for axis in "xyz"]
+    columns += [Column(axis, format=".3f") for axis in "xyz"]
     columns += [Column(f"DOP {kind}", format=".3f", key=f"dop_{kind}") for kind, *_ in KINDS]
     columns += [Column(f"sigma {kind}", unit, ".3g", f"sigma_{kind}") for kind, _, unit, _ in KINDS]
     notes = (
         "x, y, z: direction of the specific force (up) in the sensor's axes. DOP and sigma: the largest of each kind "
-        "after the pose.",
+        "after the pose; a dash where the poses do not determine it.",
         *_notes(found),
     )
     return Table("Poses to take next", tuple(columns), tuple(rows), notes).filled()
@@ -103,7 +103,9 @@ def parameter_table(found: Plan) -> Table:
         Column("sigma after", format=".3g", key="sigma_after"),
         Column("unit"),
     )
-    return Table(f"Expected after all {found.poses + len(found.directions)} poses", columns, tuple(rows)).filled()
+    return Table(
+        f"Expected after all {found.poses + len(found.directions)} poses", columns, tuple(rows)
+    ).filled()
 
 
 def record(found: Plan) -> dict[str, object]:
@@ -117,10 +119,11 @@ def record(found: Plan) -> dict[str, object]:
 
 
 def _notes(found: Plan) -> tuple[str, ...]:
-    if found.verdict == "undetermined":
-        lost = ", ".join(found.seen[-1].above(quality.UNDETERMINED)) or "all parameters"
-        return (f"After these poses there is still no determining: {lost}. Plan more poses, or another fixture.",)
-    return ()
+    if found.verdict != "undetermined":
+        return ()
+    lost = found.seen[-1].above(quality.UNDETERMINED)
+    named = ", ".join(lost) if 0 < len(lost) < len(PARAMETERS) else "all nine parameters"
+    return (f"Still not determined after these poses: {named}. Plan more poses, or another fixture.",)
 
 
 def _finite(value: float) -> float | None:

@@ -100,8 +100,8 @@ class Observability:
         return [PARAMETERS[i] for i in order if self.bounded[i] > limit]
 
 
-def information(problem: Loetters, x: Float) -> Float:
-    """Return J^T J of the nine parameters, shape (R, 9, 9), at x, shape (R, 9), from the compressed readings.
+def jacobian(problem: Loetters, x: Float) -> Float:
+    """Return d (-e) / d parameters of the compressed residuals, shape (R, 11, 9), at x, shape (R, 9).
 
     The chain runs over K_a = K_a0 (I + E)^-1, so dK_a = -K_a0 E, and dD_i = K_ii times the bias as force.
     """
@@ -113,8 +113,14 @@ def information(problem: Loetters, x: Float) -> Float:
         chain[:, :, p] = pack(change, np.zeros((len(K), 3)), 9)
     for i in range(3):
         chain[:, 6 + i, 6 + i] = K[:, i, i]
-    jacobian = problem.jacobian(x[:, None])[:, 0] / problem.units[:, None, :] @ chain / (2.0 * problem.g)
-    result: Float = jacobian.swapaxes(1, 2) @ jacobian
+    result: Float = problem.jacobian(x[:, None])[:, 0] / problem.units[:, None, :] @ chain / (2.0 * problem.g)
+    return result
+
+
+def information(problem: Loetters, x: Float) -> Float:
+    """Return J^T J of the nine parameters, shape (R, 9, 9), at x, shape (R, 9), from the compressed readings."""
+    J = jacobian(problem, x)
+    result: Float = J.swapaxes(1, 2) @ J
     return result
 
 

@@ -53,9 +53,7 @@ def command(
         float | None,
         typer.Option(help="Noise of one pose, one sigma, m/s^2.", show_default="s of the poses so far"),
     ] = None,
-    columns: Annotated[
-        str | None, typer.Option(help="The three output columns: names, or numbers from 1, with commas.")
-    ] = None,
+    columns: options.Columns = None,
     g: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
@@ -92,14 +90,13 @@ def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
 
     if Path(data).suffix in RESULTS:
         if columns is not None or g is not None:
-            raise UsageError(f"{data}: a result file has its own columns and g; leave out --columns, --g and --latitude")
+            raise UsageError(
+                f"{data}: a result file has its own columns and g; leave out --columns, --g and --latitude"
+            )
         return load_result(data)
     options.check_input(data)
-    names = None if columns is None else [part.strip() for part in columns.split(",")]
-    settings = load_settings(
-        None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})}
-    )
-    return calibrate(read_readings(data, names, stdin=sys.stdin.buffer), settings)
+    settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
+    return calibrate(read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer), settings)
 
 
 def _plan(
@@ -140,5 +137,7 @@ def _show(found: Plan, format: str) -> None:
     else:
         from accelcal_cli.output import console
 
-        console.show([pose_table(found), parameter_table(found)], console.console())
+        out = console.console()
+        console.show_split(pose_table(found), out)
+        console.show([parameter_table(found)], out)
     sys.stdout.flush()
