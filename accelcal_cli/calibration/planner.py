@@ -71,7 +71,7 @@ def next_poses(
 def best_poses(information: Float, candidates: Float, count: int) -> list[int]:
     """Return the indices of the `count` candidates that together leave the smallest largest variance, best first.
 
-    Greedy choice looks one pose ahead. An exchange (Fedorov's) mends that: each pose in turn is replaced by the
+    Greedy choice looks one pose ahead. An exchange [fedorov1972] mends that: each pose in turn is replaced by the
     candidate that suits the others best, until none is. From the greedy choice and from random ones, the best kept.
     """
     rows = design(candidates)
