@@ -37,7 +37,9 @@ def write(path: Path, rows: int) -> None:
         written = 0
         for stretch in stretches:
             block = np.column_stack([stretch.time.round(3), stretch.output.round(2)])[: rows - written]
-            polars.DataFrame(block, schema=["t", "ax", "ay", "az"]).write_csv(file, include_header=not written)
+            polars.DataFrame(block, schema=["t", "ax", "ay", "az"]).write_csv(
+                file, include_header=not written
+            )
             written += len(block)
             if written >= rows:
                 return
@@ -51,7 +53,9 @@ def main(rows: int = DAY, repeat: int = 3) -> None:
         detect = ["-m", "accelcal_cli", "detect", str(path), "--format", "csv", "-q"]
         pair = pairs(process(detect), process(["-c", SCAN, str(path)]), repeat)
         report(f"detect in {rows:,} rows ({size:.0f} MB) / polars scans", pair, 3.0)
-        peak = subprocess.run([sys.executable, "-c", PEAK, *detect], check=True, capture_output=True, text=True)
+        peak = subprocess.run(
+            [sys.executable, "-c", PEAK, *detect], check=True, capture_output=True, text=True
+        )
     print(f"peak memory of detect: {int(peak.stdout)} MiB (at most 1024)")
 
 

@@ -139,7 +139,9 @@ def test_a_gyroscope_sees_what_noise_hides():
 def test_a_constant_turning_rate_is_a_bias():
     biased = LOG.copy()
     biased[:, 3:6] += [0.3, -0.2, 0.1]
-    np.testing.assert_array_equal(found(tiled(biased))[0].intervals.start, found(tiled(LOG))[0].intervals.start)
+    np.testing.assert_array_equal(
+        found(tiled(biased))[0].intervals.start, found(tiled(LOG))[0].intervals.start
+    )
 
 
 def test_the_still_period_sets_the_level():
@@ -209,7 +211,13 @@ def test_an_envelope_stays_small_and_loses_no_peak():
 
 @pytest.mark.parametrize(
     ("text", "span"),
-    [("1", Span(1)), ("1.5s", Span(1.5)), ("2 sec", Span(2)), ("101rows", Span(101, True)), ("5 samples", Span(5, True))],
+    [
+        ("1", Span(1)),
+        ("1.5s", Span(1.5)),
+        ("2 sec", Span(2)),
+        ("101rows", Span(101, True)),
+        ("5 samples", Span(5, True)),
+    ],
 )
 def test_spans_are_seconds_or_rows(text, span):
     assert parse_span(text, "--window") == span
