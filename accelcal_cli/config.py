@@ -103,13 +103,14 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
         raise ConfigError(f"{where}: parameters: expected a mapping of keys, not {own!r}")
     if stated.get("optimizer", name) != name:
         own = {}  # the file's parameters belong to the optimizer that the command line replaced
-    parameters = {**_shipped_parameters(name), **own, **overrides.get("parameters", {})}
+    parameters = {**shipped_parameters(name), **own, **overrides.get("parameters", {})}
     settings = build(Settings, {**merged, "parameters": parameters}, where)
     settings.build_optimizer()
     return settings
 
 
-def _shipped_parameters(optimizer: Any) -> dict[str, Any]:
+def shipped_parameters(optimizer: Any) -> dict[str, Any]:
+    """Return the settings that the shipped file of an optimizer states; none for an unknown one."""
     files = shipped("optimizers")
     if not isinstance(optimizer, str) or optimizer not in files:
         return {}

@@ -30,6 +30,10 @@ class OutputError(AccelcalError):
     """A result that could not be written."""
 
 
+class Interrupted(Exception):  # noqa: N818  # it is none
+    """Work was interrupted from the keyboard; the message says what is kept and how to go on."""
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return `` (did you mean "..."?)`` for the nearest known name, or nothing when none is near."""
     choices = list(known)

@@ -11,8 +11,8 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import calibrate, simulate
-from accelcal_cli.errors import AccelcalError
+from accelcal_cli.cli import benchmark, calibrate, optimizers, simulate
+from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -46,6 +46,8 @@ app = typer.Typer(
 )
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
+app.command("benchmark")(benchmark.command)
+app.command("optimizers")(optimizers.command)
 
 
 def _version(wanted: bool) -> None:
@@ -72,6 +74,8 @@ def main() -> None:
         _fail(str(error), BAD_INPUT)
     except BadUsage as error:
         _explain(error)
+    except Interrupted as error:
+        _fail(str(error), INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except BrokenPipeError:

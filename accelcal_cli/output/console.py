@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import IO
 
 from rich import box
@@ -47,13 +48,36 @@ def show(tables: Iterable[Table], out: Console) -> None:
         out.print()
 
 
+def show_split(table: Table, out: Console) -> None:
+    """Draw a table; one too wide for the terminal in parts, each with the first column again."""
+    others = len(table.columns) - 1
+    first, start = True, 0
+    while start < others:
+        end = others
+        while end > start + 1 and _natural_width(_part(table, start, end)) > out.width:
+            end -= 1
+        part = _part(table, start, end)
+        out.print(_drawn(part if first else replace(part, title=""), out))
+        first, start = False, end
+    for note in table.notes:
+        out.print(Text(note))
+    out.print()
+
+
+def _part(table: Table, start: int, end: int) -> Table:
+    """Return the table with its first column and those from `start` to `end` - 1 of the others."""
+    keep = [0, *range(start + 1, end + 1)]
+    rows = tuple([row[i] for i in keep] for row in table.rows)
+    return replace(table, columns=tuple(table.columns[i] for i in keep), rows=rows)
+
+
 def _natural_width(table: Table) -> int:
     """Return the characters that a table needs without wrapping a cell."""
     widths = [
         max(map(len, [column.name, f"[{column.unit}]", *(column.text(row[i]) for row in table.rows)]))
         for i, column in enumerate(table.columns)
     ]
-    return sum(widths) + 2 * len(widths) + 2
+    return sum(widths) + 3 * len(widths) + 1  # a space on either side, and a line
 
 
 def _show_stacked(table: Table, out: Console) -> None:

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from accelcal_cli.errors import OutputError
 
@@ -28,8 +28,12 @@ def check_target(path: str) -> None:
 
 
 @contextmanager
-def whole_file(path: str) -> Iterator[IO[str]]:
-    """Open a text file that appears under its name only when all of it was written; "-" is standard output.
+def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
+    """Open a file that appears under its name only when all of it was written; "-" is standard output.
+
+    Args:
+        path: its name, or "-".
+        binary: for bytes; text is UTF-8 with plain line feeds.
 
     Raises:
         OutputError: it cannot be written (folder, permission, full disk); nothing is left behind.
@@ -42,7 +46,8 @@ def whole_file(path: str) -> Iterator[IO[str]]:
     temporary = ""
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        with open(handle, "w", encoding="utf-8", newline="\n") as file:
+        text = {} if binary else {"encoding": "utf-8", "newline": "\n"}
+        with open(handle, "wb" if binary else "w", **text) as file:  # type: ignore[call-overload]
             yield file
         os.chmod(temporary, _mode(target))
         os.replace(temporary, target)

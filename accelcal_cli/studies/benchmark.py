@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from accelcal_cli.optimizers.minimize import Stopping, minimize
+from accelcal_cli.errors import ConfigError
+from accelcal_cli.optimizers.minimize import Status, Stopping, minimize
+from accelcal_cli.streams import Float
 from accelcal_cli.studies.functions import TestFunction
-from accelcal_cli.studies.study import Entry, Record, Study, Task, records_of
+from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of
 from accelcal_cli.table import Column, Table
 
 
 @dataclass(frozen=True)
 class Benchmark(Study):
-    """Every optimizer on every function; cells are functions times optimizers, function by function.
+    """Every optimizer on every function that it suits; a cell is such a pair, function by function.
 
     Attributes:
         functions: names of test functions.
@@ -42,58 +46,123 @@ class Benchmark(Study):
 
     @property
     def cells(self) -> int:
-        """Functions times optimizers."""
-        return len(self.functions) * len(self.entries)
+        """Pairs of a function and an optimizer that suits it."""
+        return len(self.pairs)
 
     @property
     def runs(self) -> int:
         """Runs of each cell."""
         return self.repeats
 
-    def cell(self, number: int) -> tuple[str, Entry]:
-        """Return function name and optimizer of a cell."""
-        return self.functions[number // len(self.entries)], self.entries[number % len(self.entries)]
+    @property
+    def title(self) -> str:
+        """What is run, in one line."""
+        runs = "1 run" if self.repeats == 1 else f"{self.repeats:,} runs"
+        changes = ", shifted" * self.shift + ", rotated" * self.rotate
+        return f"Benchmark: D = {self.dimensions}, {runs}, tolerance {self.tolerance:g}, seed {self.seed}{changes}"
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, Entry], ...]:
+        """Function name and optimizer of every cell."""
+        return tuple(
+            (f, e) for f in self.functions for e in self.entries if (f, e.label) not in self.unsuited
+        )
+
+    @cached_property
+    def unsuited(self) -> tuple[tuple[str, str], ...]:
+        """Function name and label where the function lacks what the optimizer needs."""
+        built = [(entry.label, entry.build()) for entry in self.entries]
+        return tuple(
+            (name, label)
+            for name in self.functions
+            for label, optimizer in built
+            if not optimizer.suits(self.problem(name))
+        )
+
+    def problem(self, name: str) -> TestFunction:
+        """Return a test function of this study."""
+        return TestFunction(name, self.dimensions, shift=self.shift, rotate=self.rotate, seed=self.seed)
+
+    def names(self, cell: int) -> dict[str, str]:
+        """Return function and optimizer of a cell; see `Study.names`."""
+        function, entry = self.pairs[cell]
+        return {"function": function, "optimizer": entry.label}
 
     def execute(self, task: Task) -> list[Record]:
         """Return the records of a task's runs."""
-        name, entry = self.cell(task.cell)
-        problem = TestFunction(name, self.dimensions, shift=self.shift, rotate=self.rotate, seed=self.seed)
-        optimizer = entry.build()
+        name, entry = self.pairs[task.cell]
+        problem, optimizer = self.problem(name), entry.build()
         stopping = Stopping(self.tolerance if self.stop else None, self.evaluations)
+        runs = range(task.first, task.last)
         start = time.perf_counter()
-        run = minimize(
-            problem, optimizer, runs=range(task.first, task.last), seed=self.seed, stopping=stopping
-        )
+        run = minimize(problem, optimizer, runs=runs, seed=self.seed, stopping=stopping)
         return records_of(task, run, self.tolerance, time.perf_counter() - start)
+
+    def suiting(self, named: Sequence[str]) -> tuple[Benchmark, list[str]]:
+        """Return the study without optimizers that suit no function, and a sentence for everything left out.
+
+        Args:
+            named: labels that were asked for by name, which may not be left out.
+
+        Raises:
+            ConfigError: a named optimizer does not suit a function, or no cell is left.
+        """
+        notes = []
+        for entry in self.entries:
+            on = [function for function, label in self.unsuited if label == entry.label]
+            if not on:
+                continue
+            sentence = f"{entry.label} needs {_needs(entry)}, which {_listed(on)} {_lack(on)}"
+            if entry.label in named:
+                raise ConfigError(sentence)
+            notes.append(f"{sentence}: left out there")
+        used = {entry.label for _, entry in self.pairs}
+        if not used:
+            raise ConfigError("no optimizer suits any of the functions")
+        return replace(self, entries=tuple(e for e in self.entries if e.label in used)), notes
+
+
+def _needs(entry: Entry) -> str:
+    words = {"residuals": "residuals (a sum of squares)", "closed_form": "a closed form"}
+    return " and ".join(words.get(need, need) for need in entry.build().needs)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _lack(names: Sequence[str]) -> str:
+    return "does not have" if len(names) == 1 else "do not have"
 
 
 def summary(study: Benchmark, records: Sequence[Record]) -> Table:
     """Return one row a cell: statistics of the cost over the runs, success rate, evaluations, seconds."""
     rows = []
-    for number in range(study.cells):
-        name, entry = study.cell(number)
-        own = [r for r in records if r.cell == number]
-        if not own:
-            continue
-        cost = np.array([r.cost for r in own])
-        hits = [r.hit for r in own if r.hit is not None]
-        rows.append(
-            (
-                name,
-                entry.label,
-                len(own),
-                int(np.median([r.evaluations for r in own])),
-                float(cost.min()),
-                float(cost.max()),
-                float(cost.mean()),
-                float(cost.var(ddof=1)) if len(own) > 1 else None,
-                float(np.median(cost)),
-                len(hits) / len(own),
-                int(np.median(hits)) if hits else None,
-                float(np.median([r.seconds for r in own])),
-            )
-        )
+    for cell in range(study.cells):
+        own = [record for record in records if record.cell == cell]
+        if own:
+            rows.append((*study.names(cell).values(), *_statistics(own)))
     return Table("Benchmark", COLUMNS, tuple(rows))
+
+
+def _statistics(records: Sequence[Record]) -> tuple[Any, ...]:
+    """Return the numbers of one row; a run without any finite cost counts as infinite."""
+    cost = np.array([r.cost for r in records])
+    hits = [r.hit for r in records if r.hit is not None]
+    several = len(cost) > 1 and bool(np.isfinite(cost).all())
+    return (
+        len(records),
+        int(np.median([r.evaluations for r in records])),
+        float(cost.min()),
+        float(cost.max()),
+        float(cost.mean()),
+        float(cost.var(ddof=1)) if several else None,
+        float(np.median(cost)),
+        len(hits) / len(records),
+        int(np.median(hits)) if hits else None,
+        sum(r.status == Status.FAILED.name.lower() for r in records),
+        float(np.median([r.seconds for r in records])),
+    )
 
 
 COLUMNS = (
@@ -108,5 +177,16 @@ COLUMNS = (
     Column("median", format=".3g"),
     Column("success", format=".0%", key="success_rate"),
     Column("to tolerance", format=",d", key="evaluations_to_tolerance"),
+    Column("failed", format="d", key="failures"),
     Column("time", "s", ".3f", key="seconds"),
 )
+
+
+def curves(study: Benchmark, records: Sequence[Record]) -> Mapping[str, Mapping[str, tuple[Float, Float]]]:
+    """Return the median convergence (evaluations, cost) by function and optimizer."""
+    found: dict[str, dict[str, tuple[Float, Float]]] = {name: {} for name in study.functions}
+    for cell, (name, entry) in enumerate(study.pairs):
+        curve = median_curve([record for record in records if record.cell == cell])
+        if curve is not None:
+            found[name][entry.label] = curve
+    return found

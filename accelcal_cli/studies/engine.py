@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import Executor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
 
 from accelcal_cli import __version__
@@ -22,7 +21,7 @@ from accelcal_cli.studies.study import Record, Study, Task
 
 SCHEMA = "accelcal/journal/1"
 POOLS = 5
-"""Process pools started at most after workers that died: a task that kills its worker must not go on for ever."""
+"""Process pools that may break one after the other without a finished task: one that kills its worker must end."""
 
 Progress = Callable[[int, int], None]
 Executors = Callable[[], AbstractContextManager[Executor]]
@@ -44,23 +43,22 @@ class Journal:
     def open(cls, path: Path | None, study: Study, resume: bool) -> Journal:
         """Return the journal of a study, with what an interrupted one left when `resume` is set.
 
+        With `resume` and nothing there, the study starts anew: it may have been stopped that early.
+
         Raises:
             DataError: a journal is there but not to be resumed, or it belongs to another study or version.
+            OutputError: it cannot be read or written.
         """
         journal = cls(path)
         if path is None:
             return journal
         head = {"schema": SCHEMA, "study": study.identity, "version": __version__}
-        if path.exists():
-            if not resume:
-                raise DataError(
-                    f"{path}: an interrupted study left this; --resume goes on with it, or delete it"
-                )
-            journal._read(head)
-            return journal
-        if resume:
-            raise DataError(f"{path}: nothing to resume; leave out --resume")
-        journal._append(head)
+        if path.exists() and not resume:
+            raise DataError(
+                f"{path}: an interrupted study left this; --resume goes on with it, or delete it to start anew"
+            )
+        if not (path.exists() and journal._read(head)):
+            journal._append(head)
         return journal
 
     def add(self, task: Task, records: list[Record]) -> None:
@@ -82,29 +80,33 @@ class Journal:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise OutputError(
-                f"{self.path}: cannot be written: {(error.strerror or str(error)).lower()}; --resume goes on later"
-            ) from None
+            reason = (error.strerror or str(error)).lower()
+            raise OutputError(f"{self.path}: cannot be written: {reason}") from None
 
-    def _read(self, head: dict[str, str]) -> None:
+    def _read(self, head: dict[str, str]) -> bool:
+        """Take up what the file holds; False when not even its head was written. Cuts a half-written last line."""
         assert self.path is not None
-        text = self.path.read_text(encoding="utf-8", errors="replace")
-        whole = text[: text.rfind("\n") + 1]  # the last line may be half written
+        try:
+            content = self.path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            if whole != content:
+                os.truncate(self.path, len(whole))
+        except OSError as error:
+            raise OutputError(f"{self.path}: {(error.strerror or str(error)).lower()}") from None
         lines = whole.splitlines()
-        if not lines or _parsed(lines[0]) != head:
+        if lines and _parsed(lines[0]) != head:
             raise DataError(f"{self.path}: the journal of another study or version; delete it to start anew")
         for line in lines[1:]:
-            entry = _parsed(line)
-            if isinstance(entry, dict) and "task" in entry:
+            with suppress(KeyError, TypeError, ValueError):  # a damaged line: its task runs again
+                entry = json.loads(line)
                 self.done[entry["task"]] = [Record.from_json(record) for record in entry["records"]]
-        if whole != text:
-            os.truncate(self.path, len(whole.encode("utf-8", errors="replace")))
+        return bool(lines)
 
 
-def _parsed(line: str) -> object:
+def _parsed(line: bytes) -> object:
     try:
         return json.loads(line)
-    except json.JSONDecodeError:
+    except ValueError:
         return None
 
 
@@ -125,62 +127,39 @@ def run_study(
     if progress:
         progress(finished, total)
     pending = [task for task in tasks if task.key not in journal.done]
-    for task, records in _results(study, pending, executors):
-        journal.add(task, records)
-        finished += len(records)
-        if progress:
-            progress(finished, total)
+    with closing(_results(study, pending, executors)) as results:
+        for task, records in results:
+            journal.add(task, records)
+            finished += len(records)
+            if progress:
+                progress(finished, total)
     return [record for task in tasks for record in journal.done[task.key]]
 
 
 def _results(
     study: Study, tasks: list[Task], executors: Executors | None
-) -> Iterator[tuple[Task, list[Record]]]:
+) -> Generator[tuple[Task, list[Record]], None, None]:
     """Yield finished tasks as they come; a pool whose worker died is replaced and its tasks are run again."""
     if executors is None:
         for task in tasks:
             yield task, study.execute(task)
         return
     left = {task.key: task for task in tasks}
-    for attempt in range(POOLS):
+    vain = 0
+    while left:
+        before = len(left)
         try:
             with executors() as executor:
-                futures = {executor.submit(study.execute, task): task for task in left.values()}
-                for future in as_completed(futures):
-                    task = futures[future]
-                    records = future.result()
+                for task, records in _completed(executor, study, list(left.values())):
                     del left[task.key]
                     yield task, records
-            return
         except BrokenProcessPool:
-            if attempt == POOLS - 1:
-                raise DataError(f"workers died {POOLS} times; finished runs are kept") from None
+            vain = vain + 1 if len(left) == before else 0
+            if vain == POOLS:
+                raise DataError(f"workers died {POOLS} times in a row without finishing a run") from None
 
 
-@contextmanager
-def local_pool(jobs: int) -> Iterator[Executor]:
-    """Open a pool of processes on this machine; what is queued is dropped when the study stops."""
-    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def cluster(address: str) -> Iterator[Executor]:
-    """Open a Dask cluster as an executor of the concurrent.futures kind.
-
-    Raises:
-        DataError: dask is not installed, or nothing answers at the address.
-    """
-    try:
-        from dask.distributed import Client
-    except ImportError:
-        raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
-    try:
-        client = Client(address, timeout="10s")  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise DataError(f"--cluster {address}: no Dask scheduler answers there ({error})") from None
-    with client:
-        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
+def _completed(executor: Executor, study: Study, tasks: list[Task]) -> Iterator[tuple[Task, list[Record]]]:
+    futures = {executor.submit(study.execute, task): task for task in tasks}
+    for future in as_completed(futures):
+        yield futures[future], future.result()

@@ -18,9 +18,13 @@ import numpy as np
 from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer
 from accelcal_cli.optimizers.minimize import Run
 from accelcal_cli.streams import Float
+from accelcal_cli.table import Column, Table
 
-TRACE_POINTS = 200
+TRACE_POINTS = 100
 """Points of a record's convergence curve."""
+
+CURVES = 100
+"""Runs of a cell that keep their curve, the first ones: the median of so many is smooth."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class Record:
         cost: best cost; evaluations, iterations: used; status: how it ended.
         hit: evaluations when the cost first was at or below the tolerance, or None.
         values: further results of the kind of study (parameter errors, ...), by name.
-        curve: pairs (evaluations, best cost so far), thinned.
+        curve: pairs (evaluations, best cost so far), thinned; none beyond the first CURVES runs.
         seconds: wall time of the run: its share of its block's.
     """
 
@@ -100,8 +104,12 @@ class Study(ABC):
 
     @property
     def block(self) -> int:
-        """Runs of one task: the unit that is kept when a study is interrupted."""
-        return 20
+        """Runs of one task: the unit that is kept when a study is interrupted, and that a worker gets."""
+        return 5
+
+    @abstractmethod
+    def names(self, cell: int) -> dict[str, str]:
+        """Return what identifies a cell in the raw results, such as function and optimizer, by column."""
 
     @abstractmethod
     def execute(self, task: Task) -> list[Record]:
@@ -155,6 +163,34 @@ def records_of(
     ]
 
 
+def raw_table(study: Study, records: Sequence[Record]) -> Table:
+    """Return one row a run: everything that does not depend on how fast or where it ran.
+
+    Costs and values that are not finite are left for the writer to leave empty.
+    """
+    labels = list(study.names(0))
+    further = list(dict.fromkeys(name for record in records for name in record.values))
+    columns = [
+        *(Column(label) for label in labels),
+        Column("run", format="d"),
+        Column("cost", format=".6g"),
+        Column("evaluations", format="d"),
+        Column("iterations", format="d"),
+        Column("status"),
+        Column("hit", format="d"),
+        *(Column(name, format=".6g") for name in further),
+    ]
+    rows = [
+        (
+            *study.names(r.cell).values(),
+            *(r.run, r.cost, r.evaluations, r.iterations, r.status, r.hit),
+            *(r.values.get(name) for name in further),
+        )
+        for r in records
+    ]
+    return Table("Raw results", tuple(columns), tuple(rows))
+
+
 def _hit(run: Run, i: int, tolerance: float | None) -> int | None:
     if tolerance is None or run.trace is None or run.trace_evaluations is None:
         return None
@@ -163,7 +199,7 @@ def _hit(run: Run, i: int, tolerance: float | None) -> int | None:
 
 
 def _curve(run: Run, i: int) -> tuple[tuple[int, float], ...]:
-    if run.trace is None or run.trace_evaluations is None:
+    if run.trace is None or run.trace_evaluations is None or run.runs[i] >= CURVES:
         return ()
     last = int(run.iterations[i]) + 1
     keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, TRACE_POINTS))})
@@ -171,12 +207,15 @@ def _curve(run: Run, i: int) -> tuple[tuple[int, float], ...]:
     return tuple((int(n), float(c)) for n, c in zip(counts, costs, strict=True) if np.isfinite(c))
 
 
-def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float]:
-    """Return the median best cost of several runs against evaluations, both of shape (points,)."""
-    last = max(r.curve[-1][0] for r in records if r.curve)
-    grid = np.linspace(min(r.curve[0][0] for r in records if r.curve), last, points)
-    rows = []
-    for record in records:
-        counts, costs = np.array(record.curve).T
-        rows.append(costs[np.maximum(np.searchsorted(counts, grid, side="right") - 1, 0)])
+def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float] | None:
+    """Return the median best cost of several runs against evaluations, both of shape (points,).
+
+    From where all runs have a cost to the last evaluation of the longest; one that ended keeps its cost. None
+    when no run left a curve.
+    """
+    curves = [np.array(record.curve).T for record in records if record.curve]
+    if not curves:
+        return None
+    grid = np.linspace(max(n[0] for n, _ in curves), max(n[-1] for n, _ in curves), points)
+    rows = [cost[np.searchsorted(n, grid, side="right") - 1] for n, cost in curves]
     return grid, np.median(rows, axis=0)

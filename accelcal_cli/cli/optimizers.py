@@ -1,0 +1,34 @@
+"""`accelcal optimizers`: the algorithms, their settings, their sources."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from accelcal_cli.cli import options
+
+
+def command(
+    name: Annotated[
+        str | None, typer.Argument(help="One optimizer: its settings and what they mean.", show_default="all")
+    ] = None,
+    format: options.Format = "table",
+) -> None:
+    """List the optimizers: name, family, paper, parameters with defaults."""
+    from accelcal_cli.output import catalogue as show
+    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+    from accelcal_cli.studies.catalogue import catalogue, settings
+
+    options.check_format(format)
+    table = settings(name) if name else catalogue()
+    if format == "json":
+        sys.stdout.write(json_text(json_rows([table])))
+    elif format == "csv":
+        write_csv(show.flat(table), sys.stdout)
+    elif name:
+        show.show_settings(table)
+    else:
+        show.show_catalogue(table)
+    sys.stdout.flush()

@@ -1,0 +1,97 @@
+"""Convergence as a picture: one panel a function, one line an optimizer, in PNG or SVG."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from accelcal_cli.output.files import whole_file
+from accelcal_cli.streams import Float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which the colour-blind tell apart; a second round is dashed, a third dotted."""
+
+DASHES = ("-", "--", ":")
+ACROSS = 3
+"""Panels side by side at most."""
+
+Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
+
+
+def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) -> None:
+    """Write the picture, whole or not at all; the same data give the same file.
+
+    Args:
+        title: over all panels.
+        curves: evaluations and median cost by function and optimizer.
+        tolerance: drawn as a thin line.
+        path: ends in .png or .svg.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    across = min(ACROSS, math.ceil(math.sqrt(len(curves))))
+    down = -(-len(curves) // across)
+    labels = list(dict.fromkeys(label for panel in curves.values() for label in panel))
+    with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(max(4.2 * across, 6.0), 3.2 * down + 1.1), layout="constrained")
+        figure.suptitle(title, fontsize=11)
+        panels = figure.subplots(down, across, squeeze=False).ravel()
+        for axes, (name, panel) in zip(panels, curves.items(), strict=False):
+            _panel(axes, name, panel, labels, tolerance)
+        for axes in panels[len(curves) :]:
+            axes.set_axis_off()
+        figure.legend(
+            handles=_legend(labels), loc="outside lower center", ncols=min(len(labels), 5), frameon=False
+        )
+        svg = Path(path).suffix == ".svg"
+        with whole_file(path, binary=True) as file:
+            figure.savefig(
+                file, format="svg" if svg else "png", dpi=150, metadata={"Date": None} if svg else {}
+            )
+
+
+def _style(number: int) -> dict[str, Any]:
+    dashes = DASHES[number // len(COLOURS) % len(DASHES)]
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes, "linewidth": 1.6}
+
+
+def _legend(labels: list[str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    return [Line2D([], [], label=label, **_style(i)) for i, label in enumerate(labels)]
+
+
+def _panel(
+    axes: Axes, name: str, panel: Mapping[str, tuple[Float, Float]], labels: list[str], tolerance: float
+) -> None:
+    """Draw the curves of one function; a cost of zero leaves the axis at its floor."""
+    positive = [cost[cost > 0] for _, cost in panel.values()]
+    costs = np.concatenate([*positive, [tolerance]]) if tolerance > 0 else np.concatenate([*positive])
+    floor = float(costs.min()) if costs.size else 1.0
+    for label, (evaluations, cost) in panel.items():
+        axes.plot(evaluations, np.maximum(cost, floor / 10), **_style(labels.index(label)))
+    if tolerance > 0:
+        axes.axhline(tolerance, color="0.6", linewidth=0.8, zorder=0)
+        axes.annotate(
+            "tolerance",
+            (0.01, tolerance),
+            xycoords=("axes fraction", "data"),
+            fontsize=7,
+            color="0.4",
+            va="bottom",
+        )
+    axes.set_yscale("log")
+    axes.set_title(name, fontsize=10)
+    axes.set_xlabel("evaluations")
+    axes.set_ylabel("median best cost")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+    axes.ticklabel_format(axis="x", style="plain")
+    axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")

@@ -1,0 +1,115 @@
+"""Where a study runs: processes on this machine, or a Dask cluster, both as executors of concurrent.futures."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context, parent_process, resource_tracker
+from multiprocessing.process import BaseProcess
+from threading import Thread
+from typing import Any
+
+from accelcal_cli import __version__
+from accelcal_cli.errors import DataError
+
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+ANSWER_TIME = 10.0
+"""Seconds that a cluster has to answer."""
+
+
+@contextmanager
+def local_pool(jobs: int) -> Iterator[Executor]:
+    """Open a pool of processes on this machine, one BLAS thread each; it does not outlive an interruption.
+
+    The worker processes are new ones (spawn): a fork would copy locks and threads in whatever state they are.
+    """
+    others = active_children()
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_work)
+    try:
+        with _worker_surroundings():
+            for _ in range(jobs):
+                pool.submit(os.getpid)  # starts a worker
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in active_children():
+            if process not in others:
+                process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _worker_surroundings() -> Iterator[None]:
+    """Set what processes started meanwhile inherit: one BLAS thread, and no interrupt key while they load."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    resource_tracker.ensure_running()  # its own start would lift the mask
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _work() -> None:
+    """Set up a worker: it ends when its parent is gone, however that ended."""
+    parent = parent_process()
+    if parent is not None:
+        Thread(target=_leave_with, args=(parent,), daemon=True).start()
+
+
+def _leave_with(parent: BaseProcess) -> None:
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Executor]:
+    """Open a Dask cluster as an executor of the concurrent.futures kind.
+
+    Raises:
+        DataError: dask is not installed, nothing answers at the address, no worker is there, one runs another
+            version of accelcal, or the cluster is lost on the way.
+    """
+    try:
+        from distributed import Client
+        from distributed.scheduler import KilledWorker
+    except ImportError:
+        raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
+    where = f"--cluster {address}"
+    try:
+        client: Any = Client(address, timeout=ANSWER_TIME, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise DataError(f"{where}: no Dask scheduler answers there ({error})") from None
+    with client:
+        _check_workers(client, where)
+        try:
+            yield client.get_executor(pure=False)
+        except (KilledWorker, CancelledError, OSError) as error:
+            raise DataError(f"{where}: lost ({type(error).__name__} {error})") from None
+
+
+def _check_workers(client: Any, where: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=ANSWER_TIME)
+        versions = set(client.run(_version).values())
+    except TimeoutError:
+        raise DataError(f"{where}: the scheduler has no workers") from None
+    except ImportError as error:
+        raise DataError(f"{where}: the workers need accelcal {__version__} ({error})") from None
+    if versions != {__version__}:
+        other = ", ".join(sorted(versions - {__version__}))
+        raise DataError(f"{where}: a worker has accelcal {other}; expected {__version__} as here")
+
+
+def _version() -> str:
+    return __version__
