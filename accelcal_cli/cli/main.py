@@ -11,7 +11,7 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import benchmark, calibrate, optimizers, simulate
+from accelcal_cli.cli import benchmark, calibrate, navigate, optimizers, simulate
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -48,6 +48,7 @@ app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
 app.command("benchmark")(benchmark.command)
 app.command("optimizers")(optimizers.command)
+app.command("navigate")(navigate.command)
 
 
 def _version(wanted: bool) -> None:

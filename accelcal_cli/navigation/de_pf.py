@@ -31,6 +31,9 @@ class DePf(Evolving):
         "accepted by Metropolis; fitness over a window; evolution of the worst alone",
     )  # fmt: skip
     window: int = setting(10, "W, measurements of a window (roads marginal and window)", low=1, high=1000)
+    inflation: float = setting(
+        1.02, "of the covariance at a window's end: the error of moments from N particles", low=1.0, high=2.0
+    )
     F_min: float = setting(0.4, "least F [depf2015]", low=0.0, high=2.0)
     F_max: float = setting(1.0, "largest F [depf2015]", low=0.0, high=2.0)
     CR_min: float = setting(0.0, "least CR [depf2015]", low=0.0, high=1.0)
@@ -44,7 +47,8 @@ class DePf(Evolving):
         if self.mode == "literal" or self.road != "marginal":
             return super().run(scenario, streams)
         variance = self.variance or scenario.noise**2
-        return Marginal(self.particles, self.generations, self.window, variance).run(scenario, streams)
+        form = Marginal(self.particles, self.generations, self.window, variance, self.inflation)
+        return form.run(scenario, streams)
 
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
         """Return the particles after the paper's generations; see `Evolving.evolve`."""

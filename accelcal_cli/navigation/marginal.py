@@ -35,6 +35,12 @@ MOVED = 2
 SETTLED = 0.5
 """Part of the generations that is left out of the moments."""
 
+UNEXPLAINED = 4.0
+"""Least mean misfit squared over R at which no track explains a window: by chance once in 60 000 windows of ten."""
+
+SWELL = 4.0
+"""By so much the covariance grows then: the cloud is at a wrong place, or too narrow."""
+
 TINY = 1e-12
 
 
@@ -88,6 +94,7 @@ class Marginal:
     generations: int
     window: int
     variance: float
+    inflation: float
 
     def run(self, scenario: Scenario, streams: Streams) -> Track:
         """Return the track, window by window."""
@@ -98,8 +105,8 @@ class Marginal:
         )
         edge = math.sqrt(3.0)  # of the uniform initial square in sigma
         u = edge * (2.0 * streams.uniform(self.particles, MOVED) - 1.0)
-        for first in range(0, scenario.epochs, self.window):
-            last = min(first + self.window, scenario.epochs)
+        starts = range(0, scenario.epochs, self.window)
+        for first, last in zip(starts, [*starts[1:], scenario.epochs], strict=True):
             state, u = self._window(scenario, state, u, (first, last, edge), track, streams)
             edge = math.inf
         return replace(track, lookups=float(self.particles * (1 + self.generations)))
@@ -121,8 +128,11 @@ class Marginal:
         chosen = systematic(weights, streams.uniform(1, 1)[:, 0, 0])
         u = np.take_along_axis(u, chosen[:, :, None], axis=1)
         level = np.take_along_axis(likelihoods.sum(axis=1), chosen, axis=1)
+        misfit = -2.0 * likelihoods.sum(axis=1).max(axis=1)
         u, mean, covariance = self._moved(scenario, window, (u, level, edge), streams)
-        return carried(window, state, mean, covariance, u, streams)
+        lost = (misfit > UNEXPLAINED * (last - first)) & math.isinf(edge)
+        swell = np.where(lost, SWELL, 1.0)
+        return carried(window, state, (mean, self.inflation * covariance, swell), u, streams)
 
     def _likelihoods(self, scenario: Scenario, window: Window, u: Float) -> Float:
         """Return the log-likelihoods of the tracks of u, shape (R, W, n)."""
@@ -193,20 +203,21 @@ def look(scenario: Scenario, state: Gaussian, first: int, last: int) -> Window:
 
 
 def carried(
-    window: Window, state: Gaussian, mean: Float, covariance: Float, u: Float, streams: Streams
+    window: Window, state: Gaussian, found: tuple[Float, Float, Float], u: Float, streams: Streams
 ) -> tuple[Gaussian, Float]:
     """Return the Gaussian at the next window's start, and the particles in its coordinates.
 
     Args:
         window: that ends; state: at its start.
-        mean, covariance: of u, shape (R, 2) and (R, 2, 2).
+        found: mean and covariance of u, shape (R, 2) and (R, 2, 2), and what the whole covariance grows by, (R,).
         u: particles, shape (R, N, 2).
     """
+    mean, covariance, swell = found
     spread = window.through @ state.root
     centre = (window.through @ state.mean[:, :, None])[:, :, 0]
     S = np.tile(np.eye(STATES), (len(u), 1, 1))
     S[:, :MOVED, :MOVED] = covariance
-    P = spread @ S @ spread.swapaxes(1, 2) + window.noise
+    P = (spread @ S @ spread.swapaxes(1, 2) + window.noise) * swell[:, None, None]
     moved = Gaussian(centre + (spread[:, :, :MOVED] @ mean[:, :, None])[:, :, 0], root(P))
     full = np.concatenate([u, streams.normal(u.shape[1], STATES - MOVED)], axis=2)
     away = (centre - moved.mean)[:, :MOVED, None] + spread[:, :MOVED] @ full.swapaxes(1, 2)
