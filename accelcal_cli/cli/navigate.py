@@ -51,7 +51,9 @@ def command(
     period: Annotated[
         float | None, typer.Option(help="Seconds between measurements.", show_default="10")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.", min=0, show_default="0")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of all random numbers.", min=0, show_default="0")
+    ] = None,
     map: Annotated[
         str | None,
         typer.Option(
@@ -157,7 +159,7 @@ def _entries(
     if ALL in wanted:
         wanted = list(dict.fromkeys([*stated, *filter_names()]))
     chosen = [stated.get(name, FilterEntry(name, name)) for name in wanted]
-    modes = {None: [None], "both": ["default", "literal"]}.get(mode, [mode])
+    modes: list[str | None] = ["default", "literal"] if mode == "both" else [mode]
     return [limited(entry, {**settings, "mode": each}) for each in modes for entry in chosen]
 
 

@@ -40,7 +40,8 @@ def masses(fitness: Float) -> Float:
     best = fitness.max(axis=1, keepdims=True)
     weights = np.exp(fitness - best)
     span = 1.0 - weights.min(axis=1, keepdims=True)
-    return np.exp((weights - 1.0) / np.where(span > 0, span, 1.0))
+    mass: Float = np.exp((weights - 1.0) / np.where(span > 0, span, 1.0))
+    return mass
 
 
 def forces(x: Float, fitness: Float) -> Float:
@@ -60,6 +61,6 @@ def forces(x: Float, fitness: Float) -> Float:
     push = total_moment - better_moment - moment - worse_mass[:, :, None] * place
     sorted_force = (pull - push) / total_mass[:, :, None]
     sorted_force[:, 0] = 0.0
-    force = np.empty_like(sorted_force)
+    force: Float = np.empty_like(sorted_force)
     np.put_along_axis(force, order[:, :, None], sorted_force, axis=1)
     return force

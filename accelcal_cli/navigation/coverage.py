@@ -40,7 +40,7 @@ def _refuse(gravity_map: GravityMap, latitude: float, longitude: float, seconds:
     inside = south <= np.degrees(latitude) <= north and west <= np.degrees(longitude) <= east
     what = "has a cell without a value" if inside else "ends"
     raise DataError(
-        f"{gravity_map.source}: the map {what} at {np.degrees(latitude):.4f} N {np.degrees(longitude):.4f} E, within the "
-        f"position error of the track at hour {seconds / SECONDS_PER_HOUR:.2f}; it covers {south:.3f} to {north:.3f} N "
-        f"and {west:.3f} to {east:.3f} E"
+        f"{gravity_map.source}: the map {what} at {np.degrees(latitude):.4f} N {np.degrees(longitude):.4f} E, "
+        f"within the position error of the track at hour {seconds / SECONDS_PER_HOUR:.2f}; it covers {south:.3f} to "
+        f"{north:.3f} N and {west:.3f} to {east:.3f} E"
     )

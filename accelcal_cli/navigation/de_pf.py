@@ -71,9 +71,7 @@ class DePf(Evolving):
             return super()._safe(scenario, cloud, prior, k, streams)
         return self._metropolis(scenario, cloud, prior, k, streams), self.particles
 
-    def _metropolis(
-        self, scenario: Scenario, cloud: Cloud, prior: Float, k: int, streams: Streams
-    ) -> Cloud:
+    def _metropolis(self, scenario: Scenario, cloud: Cloud, prior: Float, k: int, streams: Streams) -> Cloud:
         """Resample, then move all by DE-MC on prior times likelihood; the weights are equal after."""
         x = cloud.x[..., :2]
         mean, covariance = moments(prior, x)
@@ -83,7 +81,8 @@ class DePf(Evolving):
 
         def rate(position: Float) -> Float:
             away = position - mean[:, None]
-            return self.likelihood(scenario, k, position) - 0.5 * ((away @ inverse) * away).sum(axis=2)
+            distance: Float = ((away @ inverse) * away).sum(axis=2)
+            return self.likelihood(scenario, k, position) - 0.5 * distance
 
         moved = np.take_along_axis(cloud.x, chosen[:, :, None], axis=1)
         position, level = moved[..., :2], rate(moved[..., :2])
@@ -91,5 +90,3 @@ class DePf(Evolving):
             position, level = metropolis(position, level, rate, streams)
         moved[..., :2] = position
         return Cloud(moved, np.zeros(cloud.log_weights.shape))
-
-

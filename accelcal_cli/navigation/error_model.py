@@ -22,6 +22,7 @@ from accelcal_cli.navigation.earth import (
     normal_gravity,
     radii,
 )
+from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float
 
 STATES = 12
@@ -132,9 +133,15 @@ class Grade:
         noise: white noise of a 10 s step, as a part of what the bias and the drift do in it.
     """
 
-    accelerometer: float = 50.0
-    gyro: float = 0.01
-    noise: float = 0.1
+    accelerometer: float = setting(50.0, "sigma of the constant bias, micro-g", low=0.0, high=1e6)
+    gyro: float = setting(0.01, "sigma of the constant drift, deg/h", low=0.0, high=1e4)
+    noise: float = setting(
+        0.1, "white noise of 10 s, as a part of what the biases do in it", low=0.0, high=100.0
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
 
     def biases(self) -> Float:
         """Return sigma of the five biases: m/s^2 (2), rad/s (3)."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.streams import Float
+from accelcal_cli.streams import Bool, Float, Int
 
 OUTSIDE = -1e6
 """Log-likelihood of a place that the map does not know."""
@@ -50,19 +50,20 @@ class GravityMap:
     @property
     def north(self) -> float:
         """Latitude of the last row. Units: rad."""
-        return self.south + self.step_north * (self.values.shape[0] - 1)
+        return float(self.south + self.step_north * (self.values.shape[0] - 1))
 
     @property
     def east(self) -> float:
         """Longitude of the last column. Units: rad."""
-        return self.west + self.step_east * (self.values.shape[1] - 1)
+        return float(self.west + self.step_east * (self.values.shape[1] - 1))
 
     def at(self, latitude: Float, longitude: Float) -> Float:
         """Return the anomaly in mGal, NaN where the map has none; places in rad, any one shape."""
         index, a, b, outside = self._cell(latitude, longitude)
         columns = self.values.shape[1]
         take = self._flat.take
-        below, above = take(index), take(index + columns)
+        below: Float = take(index)
+        above: Float = take(index + columns)
         below += b * (take(index + 1) - below)
         above += b * (take(index + columns + 1) - above)
         above -= below
@@ -81,13 +82,13 @@ class GravityMap:
         north[outside], east[outside] = np.nan, np.nan
         return north, east
 
-    def _cell(self, latitude: Float, longitude: Float) -> tuple[Float, Float, Float, Float]:
+    def _cell(self, latitude: Float, longitude: Float) -> tuple[Int, Float, Float, Bool]:
         """Return the flat index of the south-west node, the fractions north and east, and what is outside."""
         rows, columns = self.values.shape
         a = (np.atleast_1d(latitude) - self.south) / self.step_north
         b = (np.atleast_1d(longitude) - self.west) / self.step_east
         i, j = np.floor(a), np.floor(b)
-        outside = ~((a >= 0.0) & (a <= rows - 1) & (b >= 0.0) & (b <= columns - 1))
+        outside: Bool = ~((a >= 0.0) & (a <= rows - 1) & (b >= 0.0) & (b <= columns - 1))
         np.clip(np.nan_to_num(i, copy=False), 0, rows - 2, out=i)
         np.clip(np.nan_to_num(j, copy=False), 0, columns - 2, out=j)
         a -= i

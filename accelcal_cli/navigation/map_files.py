@@ -52,7 +52,7 @@ def _text(path: str) -> Float:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read as text: {error}") from None
-    rows = []
+    rows: list[tuple[float, float, float]] = []
     for number, line in enumerate(lines, 1):
         cells = line.split("#")[0].replace(",", " ").split()
         if not cells:
@@ -102,7 +102,7 @@ def _regular(path: str, latitude: Float, longitude: Float, values: Float) -> Gra
             raise DataError(f"{path}: the nodes are not evenly spaced in {name}")
         steps.append(np.radians(step))
     values = np.where(np.isfinite(values), values, np.nan)
-    return GravityMap(np.radians(latitude[0]), np.radians(longitude[0]), *steps, values, source=path)
+    return GravityMap(np.radians(latitude[0]), np.radians(longitude[0]), steps[0], steps[1], values, path)
 
 
 def _gridded(path: str, suffix: str) -> GravityMap:

@@ -27,7 +27,7 @@ from accelcal_cli.navigation.error_model import STATES, process_noise
 from accelcal_cli.navigation.filters import Track, log_likelihood
 from accelcal_cli.navigation.resampling import moments, normalised, systematic
 from accelcal_cli.navigation.scenario import Scenario
-from accelcal_cli.streams import Bool, Float, Streams
+from accelcal_cli.streams import Float, Streams
 
 MOVED = 2
 """d, evolved coordinates: the position."""
@@ -145,7 +145,7 @@ class Marginal:
         """Enter mean and covariance at every epoch, from the measurements up to it; return the last weights."""
         north, east = window.positions(u)
         running = np.cumsum(likelihoods, axis=1)
-        weights = np.empty(())
+        weights = likelihoods[:, 0]
         for w, k in enumerate(range(window.first, window.last)):
             weights = normalised(running[:, w])
             place = np.stack([north[:, w], east[:, w]], axis=1).swapaxes(1, 2)
@@ -166,7 +166,8 @@ class Marginal:
             return np.where(inside, 0.0 if flat else -0.5 * np.square(v).sum(axis=2), -np.inf)
 
         def rate(v: Float) -> Float:
-            return prior(v) + self._likelihoods(scenario, window, v).sum(axis=1)
+            total: Float = prior(v) + self._likelihoods(scenario, window, v).sum(axis=1)
+            return total
 
         level = level + prior(u)
         kept = []
@@ -197,9 +198,7 @@ def look(scenario: Scenario, state: Gaussian, first: int, last: int) -> Window:
     meridian, parallel = metres_per_radian(latitude)
     place = latitude, scenario.ins.longitude[:, first:last, None], 1.0 / meridian, 1.0 / parallel
     measured = scenario.measured[:, first:last, None]
-    return Window(
-        first, last, base, slope[..., :MOVED], slope[..., MOVED:], through, noise, place, measured
-    )
+    return Window(first, last, base, slope[..., :MOVED], slope[..., MOVED:], through, noise, place, measured)
 
 
 def carried(

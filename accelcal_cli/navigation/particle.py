@@ -59,7 +59,7 @@ class Sir(Filter):
         """Return the track: propagate, weigh, evolve, estimate, resample; [depf2015] steps 1 to 5."""
         track = Track.empty(scenario)
         cloud = self._start(scenario, streams)
-        F = np.empty(0)
+        F: Float = np.empty(0)
         lookups = 0
         for k in range(scenario.epochs):
             if k and self.state == STATES and (k - 1) % CHUNK == 0:
@@ -75,7 +75,11 @@ class Sir(Filter):
         return replace(track, lookups=lookups / scenario.epochs)
 
     def update(
-        self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
+        self,
+        scenario: Scenario,
+        cloud: Cloud,
+        k: int,
+        streams: Streams,  # noqa: ARG002  # an evolution draws from them
     ) -> tuple[Cloud, Float, int, Bool]:
         """Return the cloud with its new weights, these as numbers, the look-ups, and which runs see the map."""
         likelihood = self.likelihood(scenario, k, cloud.x)
@@ -103,7 +107,8 @@ class Sir(Filter):
     def _propagated(self, scenario: Scenario, x: Float, F: Float | None, streams: Streams) -> Float:
         rough = self.roughening * np.sqrt(scenario.period / 10.0)
         if F is None:
-            return x + rough * streams.normal(self.particles, 2)
+            walked: Float = x + rough * streams.normal(self.particles, 2)
+            return walked
         noise = streams.normal(self.particles, STATES)
         noise *= np.sqrt(process_noise(scenario.grade, scenario.period, rough))
         moved: Float = (F @ x.swapaxes(1, 2)).swapaxes(1, 2) + noise

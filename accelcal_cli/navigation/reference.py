@@ -1,12 +1,13 @@
 """The reference: a Gaussian sum of extended Kalman filters [alspach1972], which tells what is attainable.
 
-The initial square is covered by components, each a Kalman filter of all twelve errors, linearised at its own mean. Their
-weights follow from their innovations; the hopeless are dropped, and those that have come together are one.
+The initial square is covered by components, each a Kalman filter of all twelve errors, linearised at its own mean.
+Their weights follow from their innovations; the hopeless are dropped, and those that have come together are one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -63,7 +64,7 @@ class Reference(Filter):
         track = Track.empty(scenario)
         bank = self._start(scenario)
         Q = np.diag(process_noise(scenario.grade, scenario.period))
-        used, F = 0, np.empty(0)
+        used, F = 0, scenario.transitions(0, 0)
         for k in range(scenario.epochs):
             used += len(bank.run)
             bank, known = _updated(scenario, bank, k)
@@ -100,11 +101,14 @@ def _updated(scenario: Scenario, bank: Bank, k: int) -> tuple[Bank, Bool]:
     """Return the bank after the measurement of epoch k, and which components are on the map."""
     latitude = scenario.ins.latitude[bank.run, k]
     meridian, parallel = metres_per_radian(latitude)
-    place = latitude - bank.mean[:, 0] / meridian, scenario.ins.longitude[bank.run, k] - bank.mean[:, 1] / parallel
+    place = (
+        latitude - bank.mean[:, 0] / meridian,
+        scenario.ins.longitude[bank.run, k] - bank.mean[:, 1] / parallel,
+    )
     north, east = scenario.gravity_map.slope(*place)
     slope = np.stack([-north / meridian, -east / parallel], axis=1)
     misfit = scenario.measured[bank.run, k] - scenario.gravity_map.at(*place)
-    known = ~np.isnan(slope).any(axis=1)
+    known: Bool = ~(np.isnan(slope[:, 0]) | np.isnan(slope[:, 1]))
     slope[~known | np.isnan(misfit)] = 0.0
     misfit = np.nan_to_num(misfit)
     gain = (bank.P[:, :, :2] @ slope[:, :, None])[:, :, 0]
@@ -128,11 +132,13 @@ def _weights(bank: Bank, runs: int) -> Float:
 def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
     """Return mean (R, 2) and covariance (R, 2, 2) of the position error."""
     weight = _weights(bank, runs)
-    mean = np.stack([np.bincount(bank.run, weight * bank.mean[:, axis], runs) for axis in (0, 1)], axis=1)
+    mean: Float = np.stack(
+        [np.bincount(bank.run, weight * bank.mean[:, axis], runs) for axis in (0, 1)], axis=1
+    )
     away = bank.mean[:, :2] - mean[bank.run]
     spread = bank.P[:, :2, :2] + away[:, :, None] * away[:, None, :]
     parts = [np.bincount(bank.run, weight * spread[:, i, j], runs) for i in (0, 1) for j in (0, 1)]
-    return mean, np.stack(parts, axis=1).reshape(runs, 2, 2)
+    return mean, np.stack(parts, axis=1).reshape(runs, 2, 2).astype(float)
 
 
 def _pruned(bank: Bank, runs: int) -> Bank:
@@ -161,4 +167,4 @@ def _merged(bank: Bank) -> Bank:
 def _spans(run: Int) -> list[tuple[int, int]]:
     """Return first and one past the last component of each run."""
     edges = [0, *(np.flatnonzero(np.diff(run)) + 1).tolist(), len(run)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))

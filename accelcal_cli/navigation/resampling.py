@@ -12,7 +12,7 @@ from accelcal_cli.streams import Float, Int
 
 def normalised(log_weights: Float) -> Float:
     """Return weights that sum to 1, shape (R, N); equal ones where no particle has any likelihood."""
-    weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    weights: Float = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)
     return weights
 

@@ -133,5 +133,13 @@ def simulate(
     anomaly = gravity_map.at(true.latitude, true.longitude)
     drawn = Streams(seed, runs, GRAVITY_PURPOSE).normal(1, len(keep))[:, 0]
     return Scenario(
-        gravity_map, believed or grade, noise, initial, true.seconds, ins, anomaly + noise * drawn, error, true
+        gravity_map,
+        believed or grade,
+        noise,
+        initial,
+        true.seconds,
+        ins,
+        anomaly + noise * drawn,
+        error,
+        true,
     )

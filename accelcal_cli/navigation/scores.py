@@ -83,4 +83,5 @@ def _nees(error: Float, covariance: Float) -> Float:
     a, b, c = covariance[..., 0, 0] + 1e-6, covariance[..., 0, 1], covariance[..., 1, 1] + 1e-6
     north, east = error[..., 0], error[..., 1]
     value: Float = ((c * north - 2.0 * b * east) * north + a * east**2) / (a * c - b * b)
-    return value.mean(axis=1)
+    mean: Float = value.mean(axis=1)
+    return mean

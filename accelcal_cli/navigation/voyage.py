@@ -1,8 +1,8 @@
 """A voyage: the true track, and the errors of the inertial navigation system on it.
 
 The planned voyage is eight hours at constant speed with a turn at four [depf2015] section 4. The INS errors follow the
-error model of that track, integrated at 1 s with a midpoint rule; biases are drawn, the tilts are those that an alignment
-leaves with such biases, and draws are repeated until the error after two hours is like the paper's.
+error model of that track, integrated at 1 s with a midpoint rule; biases are drawn, the tilts are those that an
+alignment leaves with such biases, and draws are repeated until the error after two hours is like the paper's.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.errors import DataError
+from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.navigation.earth import EARTH_RATE, metres_per_radian
 from accelcal_cli.navigation.error_model import STATES, Grade, Motion, dynamics, specific_force
+from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float, Streams
 
 INS_PURPOSE = 21
@@ -37,15 +38,25 @@ class Plan:
         drift: the INS error at the filter's start lies between these, m.
     """
 
-    latitude: float = 20.2
-    longitude: float = 115.2
-    heading: float = 70.0
-    speed: float = 8.0
-    hours: float = 8.0
-    filtered: float = 2.0
-    turn: float = -90.0
-    turning: float = 600.0
-    drift: tuple[float, float] = (1000.0, 1700.0)
+    latitude: float = setting(20.2, "of the start, degrees", low=-80.0, high=80.0)
+    longitude: float = setting(115.2, "of the start, degrees", low=-360.0, high=360.0)
+    heading: float = setting(70.0, "clockwise from north, degrees", low=-360.0, high=360.0)
+    speed: float = setting(8.0, "over ground, m/s", low=0.0, high=300.0)
+    hours: float = setting(8.0, "duration", above=0.0, high=48.0)
+    filtered: float = setting(2.0, "hour at which the filter starts", low=0.0, high=47.0)
+    turn: float = setting(-90.0, "in the middle of the voyage, degrees", low=-360.0, high=360.0)
+    turning: float = setting(600.0, "duration of the turn, s", above=0.0, high=36000.0)
+    drift: tuple[float, float] = setting(
+        (1000.0, 1700.0), "limits of the INS error at the filter's start, m; like the paper's 1.35 km"
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
+        if self.filtered >= self.hours:
+            raise ConfigError(
+                f"filtered: {self.filtered:g} h; expected less than the voyage's {self.hours:g} h"
+            )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """A recorded voyage from CSV: the indicated track, gravity, and the true track where one was kept.
 
-Columns by name, in any order: time (s), latitude, longitude (degrees, indicated by the INS); and if there, gravity (mGal),
-east and north (indicated velocity, m/s), true_latitude, true_longitude (degrees). An empty gravity cell is an epoch
+Columns by name, in any order: time (s), latitude, longitude (degrees, indicated by the INS); and if there, gravity
+(mGal), east and north (indicated velocity, m/s), true_latitude, true_longitude (degrees). An
+empty gravity cell is an epoch
 without a measurement.
 """
 
@@ -111,7 +112,13 @@ def _numbers(path: str, line: int, header: list[str], cells: list[str]) -> list[
 
 
 def recorded(
-    voyage: Recorded, gravity_map: GravityMap, grade: Grade, noise: float, initial: float, runs: range, seed: int
+    voyage: Recorded,
+    gravity_map: GravityMap,
+    grade: Grade,
+    noise: float,
+    initial: float,
+    runs: range,
+    seed: int,
 ) -> Scenario:
     """Return the scenario of a recorded voyage; without gravity it is the map at the true track plus noise."""
     own = voyage.columns
@@ -125,7 +132,10 @@ def recorded(
     if voyage.has("true_latitude", "true_longitude"):
         route = _route(own, "true_latitude", "true_longitude")
         meridian, parallel = metres_per_radian(indicated.latitude)
-        away = (indicated.latitude - route.latitude) * meridian, (indicated.longitude - route.longitude) * parallel
+        away = (
+            (indicated.latitude - route.latitude) * meridian,
+            (indicated.longitude - route.longitude) * parallel,
+        )
         error = np.broadcast_to(np.stack(away, axis=-1), (*shape, 2))
     if voyage.has("gravity"):
         measured = np.broadcast_to(own["gravity"], shape)

@@ -1,4 +1,4 @@
-"""Pictures of a navigation study: the tracks over the map, and RMSE against time in latitude, longitude and position."""
+"""Pictures of a navigation study: the tracks over the map, and RMSE against time on either axis and in position."""
 
 from __future__ import annotations
 
@@ -60,12 +60,25 @@ def _draw_map(axes: Any, study: Navigation, records: Sequence[Record], labels: l
     route = scenario.route
     edges = np.degrees([grid.west, grid.east, grid.south, grid.north])
     picture = axes.imshow(
-        grid.values, origin="lower", extent=edges, cmap="Greys", alpha=0.6, aspect="auto", interpolation="bilinear"
+        grid.values,
+        origin="lower",
+        extent=edges,
+        cmap="Greys",
+        alpha=0.6,
+        aspect="auto",
+        interpolation="bilinear",
     )
     axes.figure.colorbar(picture, ax=axes, label="gravity anomaly, mGal", shrink=0.8)
     axes.plot(np.degrees(route.longitude), np.degrees(route.latitude), color="black", lw=2.5, label="true")
     ins = scenario.ins
-    axes.plot(np.degrees(ins.longitude[0]), np.degrees(ins.latitude[0]), color="0.35", lw=1.2, ls=":", label="INS alone")
+    axes.plot(
+        np.degrees(ins.longitude[0]),
+        np.degrees(ins.latitude[0]),
+        color="0.35",
+        lw=1.2,
+        ls=":",
+        label="INS alone",
+    )
     for cell, label in enumerate(labels):
         first = own(records, cell)[0]
         axes.plot(axis_of(first, "longitude")[1], axis_of(first, "latitude")[1], label=label, **_style(cell))
@@ -81,7 +94,9 @@ def _draw_errors(panels: Any, study: Navigation, records: Sequence[Record], labe
     scenario = study.waters.scenario(study.grades[0], range(min(study.repeats, 20)), study.seed)
     least = bound(scenario)
     hours = scenario.seconds / HOUR
-    keys = [(n["filter"], n["mode"], float(n["accelerometer_ug"])) for n in map(study.names, range(study.cells))]
+    keys = [
+        (n["filter"], n["mode"], float(n["accelerometer_ug"])) for n in map(study.names, range(study.cells))
+    ]
     for axes, (key, name, axis) in zip(panels, PANELS, strict=True):
         for cell, _ in enumerate(labels):
             rows = [r for r in table if (r["filter"], r["mode"], r["accelerometer_ug"]) == keys[cell]]

@@ -170,7 +170,8 @@ def summary(study: Navigation, records: Sequence[Record]) -> Table:
     """Return one row a filter: errors over hours 3 to 8, bound, lost runs, consistency, time."""
     bounds = [_bound(study, grade) for grade in study.grades]
     rows = tuple(
-        _row(study, cell, own(records, cell), bounds[cell // len(study.entries)]) for cell in range(study.cells)
+        _row(study, cell, own(records, cell), bounds[cell // len(study.entries)])
+        for cell in range(study.cells)
     )
     notes = [note for cell in range(study.cells) if (note := _note(study, cell, own(records, cell)))]
     return Table("Navigation", COLUMNS, rows, tuple(notes))
@@ -231,8 +232,8 @@ def _note(study: Navigation, cell: int, records: Sequence[Record]) -> str:
         return ""
     names = study.names(cell)
     return (
-        f"{names['filter']} ({names['mode']}): of {len(records)} runs {diverged} diverged and {lost} lost lock for a time; "
-        "their errors are in the row."
+        f"{names['filter']} ({names['mode']}): of {len(records)} runs {diverged} diverged and {lost} lost "
+        "lock; their errors are in the row."
     )
 
 
@@ -243,9 +244,7 @@ def curves(study: Navigation, records: Sequence[Record]) -> Table:
         kept = own(records, cell)
         names = study.names(cell)
         first = {axis: dict(zip(*axis_of(kept[0], axis), strict=True)) for axis in AXES}
-        squares = {
-            axis: _by_second(kept, axis) for axis in ("north", "east")
-        }
+        squares = {axis: _by_second(kept, axis) for axis in ("north", "east")}
         for second in first["sigma"]:
             north, east = squares["north"].get(second), squares["east"].get(second)
             rows.append(

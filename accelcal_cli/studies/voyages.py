@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,9 @@ class Waters:
         plan: the voyage; ins: its INS.
     """
 
-    map: str = setting("rough", "rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, XYZ text")
+    map: str = setting(
+        "rough", "rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, XYZ text"
+    )
     map_seed: int | None = setting(None, "of a generated map; not set: the study's seed", low=0)
     voyage: str = setting("", "CSV file of a recorded voyage; without one it is planned")
     plan: Plan = field(default_factory=Plan, metadata={"doc": "the planned voyage"})
@@ -75,7 +77,13 @@ class Waters:
         gravity_map = self.gravity_map(seed)
         if self.voyage:
             found = recorded(
-                read_voyage(self.voyage, self.period), gravity_map, grade, self.noise, self.initial, runs, seed
+                read_voyage(self.voyage, self.period),
+                gravity_map,
+                grade,
+                self.noise,
+                self.initial,
+                runs,
+                seed,
             )
             check_coverage(gravity_map, found.route, self.initial)
             return found
@@ -111,14 +119,16 @@ def limited(entry: FilterEntry, stated: Mapping[str, Any]) -> FilterEntry:
     Raises:
         ConfigError: an unknown filter, or a value that it does not permit.
     """
-    known = FILTERS.get(entry.filter).__dataclass_fields__
+    known = {f.name for f in fields(FILTERS.get(entry.filter))}  # type: ignore[arg-type]
     own = {name: value for name, value in stated.items() if value is not None and name in known}
     changed = replace(entry, parameters={**entry.parameters, **own})
     changed.build()
     return changed
 
 
-def load_waters(path: Path | str | None, stated: Mapping[str, Any]) -> tuple[Waters, list[FilterEntry], dict[str, Any]]:
+def load_waters(
+    path: Path | str | None, stated: Mapping[str, Any]
+) -> tuple[Waters, list[FilterEntry], dict[str, Any]]:
     """Return waters, filters, and the remaining keys `runs`, `seed`, `title`, ... of a study's file.
 
     Args:
