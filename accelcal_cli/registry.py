@@ -88,6 +88,8 @@ def convert(value: Any, hint: Any, label: str) -> Any:
 
     Whole floats such as 1e3 pass for integers, and integers for floats; nothing else is bent.
     """
+    if hint is Any:
+        return value
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 
@@ -52,3 +52,9 @@ class Table:
         """Return the rows as mappings from column key to raw value."""
         keys = [column.key or column.name for column in self.columns]
         return [dict(zip(keys, row, strict=True)) for row in self.rows]
+
+    def filled(self) -> Table:
+        """Return the table without the columns that hold nothing in any row."""
+        keep = [i for i in range(len(self.columns)) if any(row[i] is not None for row in self.rows)]
+        rows = tuple([row[i] for i in keep] for row in self.rows)
+        return replace(self, columns=tuple(self.columns[i] for i in keep), rows=rows)

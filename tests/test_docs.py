@@ -205,7 +205,7 @@ def option_table(command: str) -> str:
         )
         default = parameter.show_default if isinstance(parameter.show_default, str) else parameter.default
         if argument or default is None or (isinstance(default, bool) and not parameter.secondary_opts):
-            default = "required" if argument else ""
+            default = "required" if argument and parameter.required else ""
         rows.append(f"| {shown} | {default} | {_cell(parameter.help)} |")
     return "\n".join(rows) + "\n"
 

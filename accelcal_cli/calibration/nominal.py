@@ -10,7 +10,7 @@ from accelcal_cli.calibration.compress import Triangle
 from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
 from accelcal_cli.calibration.quality import Observability, information
-from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.sensor.model import to_gauge
 from accelcal_cli.streams import Float, Streams
 
@@ -56,7 +56,7 @@ def search_box(triangle: Triangle, settings: Settings) -> Start:
         K, source = (to_gauge(K, "symmetric") if unknowns == 12 else K), "closed form"
     else:
         K, D, source = *_sphere(triangle, settings.g), "sphere"
-    half = _half_widths(np.diagonal(K), settings, unknowns)
+    half = half_widths(np.diagonal(K), settings.box, settings.g, unknowns)
     centre = pack(K, D, unknowns)
     if source == "closed form":
         u = Streams(settings.seed, [0], purpose=BOX_PURPOSE).uniform(1, unknowns)[0, 0]
@@ -71,7 +71,7 @@ def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
 
 def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> bool:
     """Whether the poses determine what the closed form says; where they do not, noise has decided it."""
-    box = Box(pack(K, D, 9)[None], _half_widths(np.diagonal(K), settings, 9)[None])
+    box = Box(pack(K, D, 9)[None], half_widths(np.diagonal(K), settings.box, settings.g, 9)[None])
     seen = Observability.of(
         information(Loetters(triangle, settings.g, box), np.zeros((1, 9)))[0], triangle.poses
     )
@@ -93,10 +93,8 @@ def _sphere(triangle: Triangle, g: float) -> tuple[Float, Float]:
     return radius * triangle.scale[0] / g * np.eye(3), c[:3] * triangle.scale[0] + triangle.centre[0]
 
 
-def _half_widths(scale: Float, settings: Settings, unknowns: int) -> Float:
-    """Return the half-widths in the units of the unknowns, shape (unknowns,)."""
-    box = settings.box
-    mean = scale.mean()
-    return np.concatenate(
-        [box.scale * scale, np.full(unknowns - 6, box.misalignment * mean), box.bias * settings.g * scale]
-    )
+def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Float:
+    """Return the half-widths in the units of the unknowns, shape (..., unknowns), for scale factors (..., 3)."""
+    mean = scale.mean(axis=-1, keepdims=True)
+    turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
+    return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from accelcal_cli.calibration.quality import Verdict
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.model import GAUGES, ErrorModel
 from accelcal_cli.streams import Float
 
 SCHEMA = "accelcal/calibration/1"
@@ -157,15 +158,31 @@ class Calibration:
             raise DataError(f"{where}: not a calibration result: {error}") from None
 
 
-ARRAYS = ("K_a", "D_a", "K_A", "f_0", "covariance", "nominal_scale", "nominal_bias")
+SHAPES = {
+    "K_a": (3, 3),
+    "D_a": (3,),
+    "K_A": (3, 3),
+    "f_0": (3,),
+    "covariance": (9, 9),
+    "nominal_scale": (3,),
+    "nominal_bias": (3,),
+}
+WHOLE = ("K_a", "D_a", "K_A", "f_0")
+"""Arrays in which a missing number is a fault of the file."""
+
+CHOICES = {"gauge": GAUGES, "verdict": get_args(Verdict)}
 NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
 
 
 def _rebuild(name: str, value: Any) -> Any:
-    if name in ARRAYS:
-        return _array(value)
+    if name in SHAPES:
+        return _array(name, value, SHAPES[name], whole=name in WHOLE)
     if name == "sigma":
-        return Sigma(_array(value["K_a"]), _array(value["D_a"]))
+        return Sigma(_array("sigma K_a", value["K_a"], (3, 3)), _array("sigma D_a", value["D_a"], (3,)))
+    if name in CHOICES and value not in CHOICES[name]:
+        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(CHOICES[name])}")
+    if name == "g" and not (isinstance(value, int | float) and 0 < value < math.inf):
+        raise ValueError(f"g is {value!r}; expected a positive number")
     if name == "dop":
         parameters = {key: _infinite(v) for key, v in value["parameters"].items()}
         kinds = {kind: _infinite(value[kind]) for kind in ("misalignment", "scale", "bias", "worst")}
@@ -182,8 +199,8 @@ def _rebuild(name: str, value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _array(value: Any) -> Float:
-    return np.array(
+def _array(name: str, value: Any, shape: tuple[int, ...], *, whole: bool = False) -> Float:
+    array = np.array(
         [
             [math.nan if v is None else v for v in row]
             if isinstance(row, list)
@@ -192,6 +209,11 @@ def _array(value: Any) -> Float:
         ],
         dtype=float,
     )
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected {' x '.join(map(str, shape))} numbers")
+    if whole and not np.isfinite(array).all():
+        raise ValueError(f"{name}: a number is missing")
+    return array
 
 
 def _infinite(value: float | None) -> float:

@@ -36,9 +36,9 @@ def parameters(result: Calibration) -> Table:
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
     if result.gauge == "full":
         notes.append(
-            "In gauge full a rotation of the body frame is free: of the off-diagonals only K_12/K_11 + K_21/K_22, "
-            "K_13/K_11 + K_31/K_33 and K_23/K_22 + K_32/K_33 are observable, and they alone have a sigma "
-            "(next table)."
+            "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
+            "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
+            "gauge lower and the bias."
         )
     return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
 
@@ -71,9 +71,12 @@ def engineering(result: Calibration) -> Table:
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
     sigma = np.sqrt(np.diagonal(result.covariance))
-    scale = units.scale_error(result.K_a, result.nominal_scale)
-    angle = units.misalignment(result.K_a)
-    bias = units.bias_force(result.K_a, result.D_a - result.nominal_bias)
+    # In gauge lower, as their sigma: another gauge, above all the free rotation of gauge full, moves a scale factor
+    # by half the square of the misalignments, which is many times that sigma.
+    K = result.model.in_gauge("lower").K
+    scale = units.scale_error(K, result.nominal_scale)
+    angle = units.misalignment(K)
+    bias = units.bias_force(K, result.D_a - result.nominal_bias)
     lost = _lost(result)
     sigma = np.where(lost, np.nan, sigma)
     rows = [_row(f"scale factor error {AXES[i]}", scale[i], sigma[i] / per_g, "ppm", "%") for i in range(3)]

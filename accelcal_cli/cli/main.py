@@ -11,7 +11,7 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import benchmark, calibrate, navigate, optimizers, simulate
+from accelcal_cli.cli import benchmark, calibrate, compare, navigate, optimizers, reproduce, simulate
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -47,6 +47,8 @@ app = typer.Typer(
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
 app.command("benchmark")(benchmark.command)
+app.command("compare")(compare.command)
+app.command("reproduce")(reproduce.command)
 app.command("optimizers")(optimizers.command)
 app.command("navigate")(navigate.command)
 

@@ -191,6 +191,47 @@ def show(study: Navigation, records: Sequence[Record], format: str) -> None:
     sys.stdout.flush()
 
 
+def reproduce(
+    name: str,
+    runs: int | None,
+    seed: int | None,
+    raw: str | None,
+    jobs: int,
+    cluster: str | None,
+    resume: bool,
+    plot: str | None,
+    format: str,
+    quiet: bool,
+) -> None:
+    """Run a shipped experiment on navigation filters and print it beside the paper's numbers."""
+    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+    from accelcal_cli.studies.navigation import Navigation, beside, summary
+    from accelcal_cli.studies.voyages import load_waters
+
+    waters, entries, further = load_waters(name, {})
+    number = further["seed"] if seed is None else seed
+    study = Navigation(waters, tuple(entries), (waters.ins,), runs or further["runs"], number)
+    records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
+    table = beside(summary(study, records), further)
+    if format == "json":
+        parts = [{"title": table.title, "rows": json_rows([table])}]
+        sys.stdout.write(json_text({"name": name, "title": further["title"], "tables": parts}))
+    elif format == "csv":
+        write_csv(table, sys.stdout)
+    else:
+        from accelcal_cli.output import console as rich_console
+
+        rich_console.show_split(table, rich_console.console())
+    sys.stdout.flush()
+    if plot is not None:
+        from accelcal_cli.output.voyage import plot_voyage
+
+        plot_voyage(study, records, plot)
+    if not quiet:
+        for path in filter(None, (raw, plot)):
+            typer.echo(f"accelcal: wrote {path}", err=True)
+
+
 def _write_curves(study: Navigation, records: Sequence[Record], output: str) -> None:
     from accelcal_cli.output.files import whole_file
     from accelcal_cli.output.plain import write_csv

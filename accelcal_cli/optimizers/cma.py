@@ -12,7 +12,7 @@ import numpy as np
 
 from accelcal_cli.optimizers.base import CONVERGED, RUNNING, State
 from accelcal_cli.problem import Problem
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Bool, Float, Streams
 
 SMALLEST_SIGMA = 1e-300
 
@@ -101,10 +101,13 @@ def step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaSta
     k = Constants.of(samples, D)
     z = rng.normal(samples, D)
     y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
-    x = np.clip(state.mean[:, None] + state.sigma[:, None, None] * y, problem.lower, problem.upper)  # eq. 40
+    x = state.mean[:, None] + state.sigma[:, None, None] * y  # eq. 40
+    x, outside = np.clip(x, problem.lower, problem.upper), x
+    # The steps as drawn, not as rounded: rounded to the spacing of doubles around the mean they shrink to nothing, and
+    # sigma with them, one step of that spacing before the minimum.
+    y = np.where(x == outside, y, (x - state.mean[:, None]) / state.sigma[:, None, None])
     fx = problem.cost(x)
     order = np.argsort(fx, axis=1, kind="stable")[:, : len(k.weights)]
-    y = (x - state.mean[:, None]) / state.sigma[:, None, None]
     chosen = np.take_along_axis(y, order[..., None], axis=1)
     moved = np.add.reduce(k.weights[:, None] * chosen, axis=1)  # eq. 41
     mean = state.mean + state.sigma[:, None] * moved  # eq. 42
@@ -114,6 +117,8 @@ def step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaSta
     ) * white  # eq. 43
     length = np.sqrt(np.add.reduce(path_sigma**2, axis=1))
     sigma = state.sigma * np.exp(k.c_sigma / k.d_sigma * (length / k.chi - 1))  # eq. 44
+    sigma = np.where(_flat(fx), sigma * math.exp(0.2 + k.c_sigma / k.d_sigma), sigma)
+    sigma = np.minimum(sigma, (problem.upper - problem.lower).max())
     bound = (1.4 + 2 / (D + 1)) * k.chi * math.sqrt(1 - (1 - k.c_sigma) ** (2 * (state.generation + 1)))
     short = (length < bound)[:, None]  # h_sigma
     path_c = (1 - k.c_c) * state.path_c + short * math.sqrt(k.c_c * (2 - k.c_c) * k.mu_eff) * moved  # eq. 45
@@ -126,6 +131,13 @@ def step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaSta
     return CmaState(
         x, fx, mean, sigma, C, axes, lengths, path_sigma, path_c, state.generation + 1, used, status=status
     )
+
+
+def _flat(fx: Float) -> Bool:
+    """Return which runs' best 70 % of samples cost the same: no direction to go, so the step has to grow."""
+    ranked = np.sort(fx, axis=1)
+    flat: Bool = ranked[:, 0] == ranked[:, math.ceil(0.7 * fx.shape[1]) - 1]
+    return flat
 
 
 def _whiten(state: CmaState, y: Float) -> Float:

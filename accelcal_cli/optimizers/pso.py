@@ -59,6 +59,7 @@ class ParticleSwarm(Optimizer):
     social: float = setting(1.49618, "pull towards the global best (c1)", low=0, high=10)
     cognitive: float = setting(1.49618, "pull towards the own best (c2)", low=0, high=10)
     speed: float = setting(0.2, "velocity limit as a part of the half box (v_max)", above=0, high=100)
+    draws: int = setting(1, "uniform numbers averaged for each pull", low=1, high=100)
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> SwarmState:
         """Start at rest: v = 0."""
@@ -69,6 +70,10 @@ class ParticleSwarm(Optimizer):
         """Move the swarm once."""
         x = state.x
         r = rng.uniform(x.shape[1], 2 * x.shape[2])
+        if self.draws > 1:
+            for _ in range(self.draws - 1):
+                r += rng.uniform(x.shape[1], 2 * x.shape[2])
+            r /= self.draws
         v = velocity(
             x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive
         )

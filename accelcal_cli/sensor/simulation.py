@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,8 @@ from accelcal_cli.registry import check, setting
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.streams import Float, Streams
 
-NOISE_PURPOSE, ATTITUDE_PURPOSE = 2, 3
-"""Streams of the noise and of random attitudes."""
+NOISE_PURPOSE, ATTITUDE_PURPOSE, SENSOR_PURPOSE = 2, 3, 5
+"""Streams of the noise, of random attitudes and of sensors drawn from their type."""
 
 Row = tuple[float, float, float]
 
@@ -69,6 +70,24 @@ class Simulated:
     pose: Float
     output: Float
     force: Float
+
+
+def draw(sensor: Sensor, runs: Sequence[int], seed: int) -> ErrorModel:
+    """Return sensors of one type, one a run: K of shape (R, 3, 3), D of shape (R, 3).
+
+    Around the ideal sensor of the type (its mean scale factor, no misalignment, no bias) with its spread.
+
+    Args:
+        sensor: the type.
+        runs: numbers of the runs; run r draws the same sensor in any company.
+        seed: of all draws.
+    """
+    z = Streams(seed, runs, purpose=SENSOR_PURPOSE).normal(4, 3)
+    nominal = float(np.trace(np.array(sensor.K_a))) / 3.0
+    scale = nominal * (1.0 + sensor.spread.scale * z[:, 0])
+    turned = np.broadcast_to(np.eye(3), (len(z), 3, 3)).copy()
+    turned[:, [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = sensor.spread.misalignment * z[:, 1:3].reshape(-1, 6)
+    return ErrorModel(scale[..., None] * turned, scale * sensor.spread.bias * z[:, 3])
 
 
 def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, seed: int) -> Simulated:

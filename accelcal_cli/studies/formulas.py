@@ -42,9 +42,9 @@ def modified_rosenbrock(z: Float) -> Float:
 def rastrigin(z: Float) -> Float:
     """Return sum z_i^2 - 10 cos(2 pi z_i) + 10. [dpso2014] section 3.1."""
     waves = np.cos(2.0 * math.pi * z)
-    waves -= 1.0
     waves *= -10.0
     waves += z * z
+    waves += 10.0
     total: Float = np.add.reduce(waves, axis=-1)
     return total
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -235,6 +236,17 @@ def _note(study: Navigation, cell: int, records: Sequence[Record]) -> str:
         f"{names['filter']} ({names['mode']}): of {len(records)} runs {diverged} diverged and {lost} lost "
         "lock; their errors are in the row."
     )
+
+
+def beside(table: Table, further: Mapping[str, Any]) -> Table:
+    """Return a summary with the paper's RMSE of the position beside ours, and the study's title and note."""
+    paper = {str(name).lower(): value for name, value in (further.get("paper") or {}).items()}
+    at = [column.key for column in table.columns].index("rmse_position_m") + 1
+    rows = [(*row[:at], paper.get(str(row[0]).lower()), *row[at:]) for row in table.rows]
+    column = Column("paper", "m", ".1f", key="paper_m")
+    notes = tuple(filter(None, (*table.notes, further.get("note"))))
+    title = str(further.get("title", table.title))
+    return Table(title, (*table.columns[:at], column, *table.columns[at:]), tuple(rows), notes)
 
 
 def curves(study: Navigation, records: Sequence[Record]) -> Table:

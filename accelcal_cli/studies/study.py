@@ -69,7 +69,7 @@ class Record:
         hit: evaluations when the cost first was at or below the tolerance, or None.
         values: further results of the kind of study (parameter errors, ...), by name.
         curve: pairs (evaluations, best cost so far), thinned; none beyond the first CURVES runs.
-        seconds: wall time of the run: its share of its block's.
+        seconds: time of the run: its share of its block's.
     """
 
     cell: int
@@ -133,7 +133,7 @@ class Study(ABC):
 def records_of(
     task: Task,
     run: Run,
-    tolerance: float | None,
+    tolerance: float | Float | None,
     seconds: float,
     values: Sequence[dict[str, float | None]] | None = None,
 ) -> list[Record]:
@@ -142,10 +142,11 @@ def records_of(
     Args:
         task: whose runs they are.
         run: what `minimize` returned, with its trace.
-        tolerance: cost that counts as a hit; None has no hits.
-        seconds: wall time of the block.
+        tolerance: cost that counts as a hit, for all runs or shape (R,); None has no hits.
+        seconds: time of the block.
         values: further results of each run.
     """
+    limits = np.broadcast_to(np.nan if tolerance is None else tolerance, len(run.runs))
     return [
         Record(
             task.cell,
@@ -154,7 +155,7 @@ def records_of(
             int(run.evaluations[i]),
             int(run.iterations[i]),
             run.status[i].name.lower(),
-            _hit(run, i, tolerance),
+            _hit(run, i, limits[i]),
             dict(values[i]) if values else {},
             _curve(run, i),
             seconds / len(run.runs),
@@ -191,10 +192,10 @@ def raw_table(study: Study, records: Sequence[Record]) -> Table:
     return Table("Raw results", tuple(columns), tuple(rows))
 
 
-def _hit(run: Run, i: int, tolerance: float | None) -> int | None:
-    if tolerance is None or run.trace is None or run.trace_evaluations is None:
+def _hit(run: Run, i: int, limit: float) -> int | None:
+    if run.trace is None or run.trace_evaluations is None:
         return None
-    reached = np.flatnonzero(run.trace[i] <= tolerance)
+    reached = np.flatnonzero(run.trace[i] <= limit)
     return int(run.trace_evaluations[i][reached[0]]) if len(reached) else None
 
 

@@ -1,0 +1,200 @@
+"""What the runs of a calibration study calibrate: simulated sensors of known errors, or one recording.
+
+A scene is the problem of a block of runs with what their results are judged by. Run r draws its sensor, its noise
+and its box from its own streams, so that it is the same in any company.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from accelcal_cli.calibration.compress import Triangle, compress, compress_each
+from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
+from accelcal_cli.calibration.lotters import Box, Loetters, pack
+from accelcal_cli.calibration.nominal import BOX_PURPOSE, SHIFT, half_widths
+from accelcal_cli.calibration.quality import information
+from accelcal_cli.calibration.search import polish
+from accelcal_cli.calibration.settings import BoxSettings
+from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.sensor.model import ErrorModel, to_gauge
+from accelcal_cli.sensor.poses import directions
+from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, NOISE_PURPOSE, Sensor, draw
+from accelcal_cli.streams import Float, Streams
+
+START_PURPOSE = 6
+"""Stream of starting points outside the box."""
+
+FEWEST = 9
+"""Poses that nine parameters need."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Simulated readings.
+
+    Attributes:
+        sensor: its configured errors, or the type that sensors are drawn from.
+        drawn: whether every run has a sensor of its own.
+        positions, scheme: the poses; noise: one sigma of a reading and axis, m/s^2.
+    """
+
+    sensor: Sensor
+    drawn: bool = True
+    positions: int = 12
+    scheme: str | None = None
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse poses that cannot determine nine parameters, and noise that is none."""
+        if self.positions < FEWEST:
+            raise ConfigError(
+                f"positions: {self.positions} is too few; nine parameters need at least {FEWEST}"
+            )
+        if not (np.isfinite(self.noise) and self.noise >= 0):
+            raise ConfigError(f"noise: {self.noise:g}: expected zero or more, in m/s^2")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Real readings of one sensor, compressed: every run searches on the same ones."""
+
+    source: str
+    sha256: str
+    triangle: tuple[tuple[float, ...], ...]
+    centre: tuple[float, ...]
+    scale: float
+    poses: int
+
+    @classmethod
+    def of(cls, readings: Readings) -> Recording:
+        """Return readings as part of a study.
+
+        Raises:
+            DataError: fewer than nine poses.
+        """
+        if readings.poses < FEWEST:
+            raise DataError(
+                f"{readings.source}: {readings.poses} poses; nine parameters need at least {FEWEST}, better 12 or more"
+            )
+        centre = 0.5 * (readings.lower + readings.upper)
+        scale = 0.5 * float((readings.upper - readings.lower).max())
+        packed = compress(((block, None) for _, block in readings.blocks()), centre, scale)
+        return cls(
+            readings.source,
+            readings.sha256,
+            tuple(tuple(row) for row in packed.R[0].tolist()),
+            tuple(centre.tolist()),
+            scale,
+            readings.poses,
+        )
+
+
+@dataclass(frozen=True)
+class Search:
+    """The search space of a calibration study.
+
+    Attributes:
+        g: local gravity, m/s^2.
+        unknowns: 9 (lower-triangular K_a) or 12 (full, as the DPSO and AKPSO papers search).
+        box: half-widths; nominal: scale factor in the middle, bias 0 there; None takes the closed form of each
+            run's readings, moved by a random part of the half-widths.
+        start: half-widths of the starting points about the nominal sensor; None is the box.
+    """
+
+    g: float
+    unknowns: int = 9
+    box: BoxSettings = field(default_factory=BoxSettings)
+    nominal: float | None = None
+    start: BoxSettings | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The calibrations of R runs.
+
+    Attributes:
+        problem: the cost of each.
+        truth: errors of each sensor in gauge `lower`; of a recording, those at the least cost.
+        least: least cost, by Levenberg-Marquardt from the truth or the closed form, (m/s^2)^4, shape (R,).
+        information: J^T J of the nine parameters at the truth, shape (R, 9, 9).
+    """
+
+    problem: Loetters
+    truth: ErrorModel
+    least: Float
+    information: Float
+
+
+def simulated(source: Simulation, space: Search, runs: Sequence[int], seed: int) -> Scene:
+    """Return the scene of simulated sensors for the runs of these numbers."""
+    sensor = draw(source.sensor, runs, seed) if source.drawn else source.sensor.model
+    K = np.broadcast_to(sensor.K, (len(runs), 3, 3))
+    D = np.broadcast_to(sensor.D, (len(runs), 3))
+    random = Streams(seed, [0], purpose=ATTITUDE_PURPOSE).normal(source.positions, 3)[0]
+    force = space.g * directions(source.positions, source.scheme, random)
+    clean = force @ K.swapaxes(1, 2) + D[:, None]
+    noise = source.noise * Streams(seed, runs, purpose=NOISE_PURPOSE).normal(source.positions, 3)
+    triangle = compress_each(clean + noise @ K.swapaxes(1, 2))
+    problem = Loetters(triangle, space.g, _box(triangle, space, runs, seed))
+    least = polish(problem, np.clip(problem.coordinates(K, D), -1.0, 1.0)).cost
+    truth = ErrorModel(to_gauge(K, "lower"), D)
+    return Scene(problem, truth, least, _information(compress_each(clean), space.g, truth))
+
+
+def recorded(source: Recording, space: Search, runs: Sequence[int], seed: int) -> Scene:
+    """Return the scene of a recording for the runs of these numbers."""
+    one = Triangle(
+        np.array([source.triangle]), np.array([source.centre]), np.array([source.scale]), source.poses
+    )
+    triangle = one.take(np.zeros(len(runs), dtype=np.intp))
+    problem = Loetters(triangle, space.g, _box(triangle, space, runs, seed))
+    start = np.nan_to_num(np.clip(problem.closed_form(), -1.0, 1.0))
+    found = polish(problem, start)
+    K, D = problem.parameters(found.x)
+    truth = ErrorModel(to_gauge(K, "lower"), D)
+    return Scene(problem, truth, found.cost, _information(triangle, space.g, truth))
+
+
+def starting_points(
+    scene: Scene, space: Search, population: int, runs: Sequence[int], seed: int
+) -> Float | None:
+    """Return starting points in box coordinates, shape (R, P, D), or None for the box itself."""
+    if space.start is None:
+        return None
+    box = scene.problem.box
+    scale = np.broadcast_to(space.nominal or box.centre[:, :3].mean(axis=1, keepdims=True), (len(runs), 3))
+    centre = pack(scale[..., None] * np.eye(3), np.zeros((len(runs), 3)), space.unknowns)
+    half = half_widths(scale, space.start, space.g, space.unknowns)
+    u = 2.0 * Streams(seed, runs, purpose=START_PURPOSE).uniform(population, space.unknowns) - 1.0
+    return (centre[:, None] + half[:, None] * u - box.centre[:, None]) / box.half[:, None]
+
+
+def _information(triangle: Triangle, g: float, truth: ErrorModel) -> Float:
+    theta = pack(truth.K, truth.D, 9)
+    return information(Loetters(triangle, g, Box(np.zeros_like(theta), np.ones_like(theta))), theta)
+
+
+def _box(triangle: Triangle, space: Search, runs: Sequence[int], seed: int) -> Box:
+    """Return the box of each run: about the stated nominal, or about the closed form and moved."""
+    shape = (len(runs), 3)
+    if space.nominal is not None:
+        scale = np.full(shape, space.nominal)
+        half = half_widths(scale, space.box, space.g, space.unknowns)
+        return Box(pack(scale[..., None] * np.eye(3), np.zeros(shape), space.unknowns), half)
+    K, D = _closed_form(triangle, space.g)
+    if space.unknowns == 12:  # of the valley, the point closest to no rotation
+        K = to_gauge(K, "symmetric")
+    half = half_widths(np.einsum("rii->ri", K), space.box, space.g, space.unknowns)
+    u = Streams(seed, runs, purpose=BOX_PURPOSE).uniform(1, space.unknowns)[:, 0]
+    return Box(pack(K, D, space.unknowns) + SHIFT * (2.0 * u - 1.0) * half, half)
+
+
+def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
+    """Return K, shape (R, 3, 3), and D, (R, 3): the ellipsoid, or without one the sphere the readings span."""
+    K, d = fit_ellipsoid(triangle)
+    K = np.where(np.isnan(K), np.eye(3), K) * triangle.scale[:, None, None] / g
+    return K, np.nan_to_num(d) * triangle.scale[:, None] + triangle.centre

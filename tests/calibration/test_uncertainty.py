@@ -1,0 +1,112 @@
+"""Two thousand calibrations of simulated readings: the stated intervals cover the truth as often as they say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, t
+from simulated import DPSO
+
+from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.compress import compress_each
+from accelcal_cli.calibration.lotters import Box, Loetters, pack
+from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
+from accelcal_cli.optimizers.minimize import Status, minimize
+from accelcal_cli.sensor import poses
+from accelcal_cli.streams import Streams
+
+G, RUNS, SIGMA = 9.8, 2000, 1e-3
+TRUTH = DPSO.in_gauge("lower")
+
+
+class Fits:
+    """All fits at once: parameters, covariance, and the errors of the nine parameters in m/s^2."""
+
+    def __init__(self, u):
+        noise = Streams(11, range(RUNS)).normal(len(u), 3)
+        outputs = DPSO.output(G * u + SIGMA * noise)
+        centre = pack(TRUTH.K, TRUTH.D, 9) + 3000.0
+        box = Box(np.repeat(centre[None], RUNS, axis=0), np.full((RUNS, 9), 3e4))
+        problem = Loetters(compress_each(outputs), G, box)
+        solver = LevenbergMarquardt()
+        self.run = minimize(problem, solver, runs=RUNS, start=np.zeros((RUNS, 1, 9)), trace=False)
+        self.K, self.D = problem.parameters(self.run.x)
+        self.freedom = len(u) - 9
+        self.s2 = self.run.cost / (4 * G**2) / self.freedom
+        self.cofactor = np.linalg.inv(quality.information(problem, self.run.x))
+        self.errors = self._errors()
+
+    def _errors(self):
+        """What the truth is off the fit, in the fit's own nine parameters."""
+        E = np.linalg.solve(TRUTH.K, self.K) - np.eye(3)  # K_A truth = (I + E) K_A fit
+        bias = (TRUTH.D - self.D) / np.diagonal(self.K, axis1=1, axis2=2)
+        return np.concatenate([G * E[:, [0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1]], bias], axis=1)
+
+    def sigma(self):
+        return np.sqrt(self.s2[:, None] * np.diagonal(self.cofactor, axis1=1, axis2=2))
+
+
+@pytest.fixture(scope="module")
+def fits():
+    return Fits(poses.turns())
+
+
+def test_every_fit_converges(fits):
+    assert set(fits.run.status) == {Status.CONVERGED}
+    assert len(np.unique(fits.run.cost)) == RUNS
+
+
+def test_intervals_of_95_percent_cover_the_truth(fits):
+    half = t.ppf(0.975, fits.freedom) * fits.sigma()
+    covered = (np.abs(fits.errors) <= half).mean(axis=0)
+    assert covered.shape == (9,)
+    assert (covered >= 0.93).all(), covered
+    assert (covered <= 0.97).all(), covered
+
+
+def test_intervals_of_other_levels_cover_as_often_too(fits):
+    for level in (0.5, 0.8, 0.99):
+        half = t.ppf(0.5 + level / 2, fits.freedom) * fits.sigma()
+        covered = (np.abs(fits.errors) <= half).mean()
+        assert covered == pytest.approx(level, abs=0.015)
+
+
+def test_intervals_of_the_printed_parameters_cover_the_truth(fits):
+    """K_a and D_a in gauge lower with the propagated sigma, which is what a user reads."""
+    quantile, covered, below = t.ppf(0.975, fits.freedom), [], np.tril_indices(3)
+    for K, D, s2, cofactor in zip(fits.K, fits.D, fits.s2, fits.cofactor, strict=True):
+        sigma_K, sigma_D = quality.propagate(K, K, s2 * cofactor, "lower", G)
+        covered.append(
+            np.concatenate(
+                [
+                    np.abs(K - TRUTH.K)[below] <= quantile * sigma_K[below],
+                    np.abs(D - TRUTH.D) <= quantile * sigma_D,
+                ]
+            )
+        )
+    share = np.mean(covered, axis=0)
+    assert (share >= 0.93).all(), share
+    assert (share <= 0.97).all(), share
+
+
+def test_parameter_variances_are_at_the_cramer_rao_bound(fits):
+    rows = quality.design(poses.turns())
+    bound = SIGMA**2 * np.diagonal(np.linalg.inv(rows.T @ rows))
+    ratio = fits.errors.var(axis=0) / bound
+    assert (np.abs(ratio - 1) <= 0.10).all(), ratio
+    assert (np.abs(fits.errors.mean(axis=0)) <= 4 * np.sqrt(bound / RUNS)).all()
+
+
+def test_covariances_are_those_of_the_bound(fits):
+    rows = quality.design(poses.turns())
+    bound = SIGMA**2 * np.linalg.inv(rows.T @ rows)
+    got = np.cov(fits.errors.T)
+    size = np.sqrt(np.outer(np.diagonal(bound), np.diagonal(bound)))
+    assert (np.abs(got - bound) <= 0.12 * size).all()
+
+
+def test_the_noise_is_estimated_without_bias(fits):
+    assert fits.s2.mean() == pytest.approx(SIGMA**2, rel=0.03)
+    scaled = fits.freedom * fits.s2 / SIGMA**2
+    share = (scaled > chi2.ppf(0.95, fits.freedom)).mean()
+    assert share == pytest.approx(0.05, abs=0.02)
