@@ -72,7 +72,8 @@ def square_error(e: Float, g: float) -> float:
 
 def length_error(e: Float, g: float) -> Float:
     """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, both of shape (B,)."""
-    return np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
+    length: Float = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0))
+    return length - g
 
 
 def examine(
