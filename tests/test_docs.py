@@ -38,7 +38,9 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)(?: +(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
-GENERATED = re.compile(r"(<!-- (options|keys|parameters|optimizers): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+GENERATED = re.compile(
+    r"(<!-- (options|keys|parameters|optimizers): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL
+)
 SYMBOL = re.compile(r" \((\w+(?:, or \w+)?)\)|(?<=S-curve): (\w)$")
 """The symbol of a setting in its description."""
 PICTURE = re.compile(r"^Made by `accelcal (\w+ .*--plot (docs/optimizers/\S+))`\.$", re.MULTILINE)
