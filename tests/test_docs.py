@@ -1,6 +1,6 @@
 """The documentation is true: its commands run and print what it says, and nothing is left out of it.
 
-`python tests/test_docs.py` writes the generated tables and the outputs into the pages anew.
+`python tests/test_docs.py [PAGE ...]` writes the generated tables and the outputs into the pages anew.
 """
 
 from __future__ import annotations
@@ -204,8 +204,14 @@ def option_table(command: str) -> str:
             else ", ".join(f"`{name}`" for name in sorted(names, key=len))
         )
         default = parameter.show_default if isinstance(parameter.show_default, str) else parameter.default
-        if argument or default is None or (isinstance(default, bool) and not parameter.secondary_opts):
-            default = "required" if argument and parameter.required else ""
+        if argument and parameter.required:
+            default = "required"
+        elif isinstance(default, bool):
+            default = (
+                parameter.opts[0].lstrip("-") if default else "".join(parameter.secondary_opts).lstrip("-")
+            )
+        elif default is None:
+            default = ""
         rows.append(f"| {shown} | {default} | {_cell(parameter.help)} |")
     return "\n".join(rows) + "\n"
 
@@ -406,5 +412,5 @@ def _renewed(expected: list[str], printed: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    for changed in PAGES:
+    for changed in [Path(name).resolve() for name in sys.argv[1:]] or PAGES:
         refresh(changed)

@@ -82,7 +82,8 @@ class Loetters(Problem):
         shift[:, -3:] = triangle.centre
         self._centre = (box.centre - shift) / (unit * triangle.scale[:, None])
         self._half = box.half / (unit * triangle.scale[:, None])
-        self._R, self._t = triangle.R[..., :10] * g**2, triangle.R[..., 10:] * g**2
+        self._triangle = triangle.R * g**2  # residuals in (m/s^2)^2
+        self._R = self._triangle[..., :10]
 
     @property
     def units(self) -> Float:
@@ -91,15 +92,14 @@ class Loetters(Problem):
 
     def cost(self, x: Float) -> Float:
         """Return L in (m/s^2)^4, shape (R, P)."""
-        r = self._R @ self._quadratic(x)
-        r -= self._t
+        r = self._triangle @ self._quadratic(x)
         r *= r
         cost: Float = np.add.reduce(r, axis=1)
         return cost
 
     def residuals(self, x: Float) -> Float:
         """Return the 11 compressed residuals in (m/s^2)^2, shape (R, P, 11)."""
-        r: Float = self._R @ self._quadratic(x) - self._t
+        r: Float = self._triangle @ self._quadratic(x)
         return r.transpose(0, 2, 1)
 
     def jacobian(self, x: Float) -> Float:
@@ -173,10 +173,9 @@ class Loetters(Problem):
         return (pack(K, D, self.unknowns) - self.box.centre) / self.box.half
 
     def _quadratic(self, x: Float) -> Float:
-        """Return the ten entries of Q = M^T M, shape (R, 10, P), at x, shape (R, P, D)."""
-        theta = np.zeros(
-            (len(x), self.unknowns + 1, x.shape[1])
-        )  # the last row, of zeros, is above the diagonal
+        """Return the ten entries of Q = M^T M and -1, shape (R, 11, P), at x, shape (R, P, D)."""
+        # The last row, of zeros, is what is above the diagonal of a lower-triangular K.
+        theta = np.zeros((len(x), self.unknowns + 1, x.shape[1]))
         unknowns = theta[:, :-1]
         np.multiply(self._half[..., None], x.transpose(0, 2, 1), out=unknowns)
         unknowns += self._centre[..., None]
@@ -184,7 +183,9 @@ class Loetters(Problem):
         first, second = PAIRS
         products = M.take(first, axis=1)
         products *= M.take(second, axis=1)
-        q: Float = np.add.reduce(products, axis=2)
+        q = np.empty((len(x), 11, x.shape[1]))
+        np.add.reduce(products, axis=2, out=q[:, :10])
+        q[:, 10] = -1.0
         return q
 
 

@@ -130,18 +130,22 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
     Args:
         K: K_a in `gauge`; K_lower: the same sensor in gauge `lower`.
         covariance: of the nine parameters, (m/s^2)^2, shape (9, 9).
-        gauge: `lower`, `upper` or `symmetric`; in `full` the off-diagonals are not observable one by one and
-            come out as NaN.
+        gauge: `lower`, `upper` or `symmetric`; in `full` the free rotation moves every entry of K_a, the diagonal to
+            second order, and they come out as NaN.
         g: local gravity, m/s^2.
     """
+    sigma_D = np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+    if gauge == "full":
+        return np.full((3, 3), np.nan), sigma_D
     chain = gauge_chain(K, K_lower, gauge, g)
     lost = np.isnan(np.diagonal(covariance)[:6])
     variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
     touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
     sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
-    if gauge == "full":
-        sigma_K = np.where(np.eye(3) > 0, sigma_K, np.nan)
-    return sigma_K, np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}.get(
+        gauge, np.zeros((3, 3))
+    )
+    return np.where(exact, 0.0, sigma_K), sigma_D  # a zero of the gauge has no error
 
 
 def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
@@ -157,13 +161,9 @@ def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
     for i, j in ROWS_COLUMNS[:6]:
         E = np.zeros((3, 3))
         E[i, j] = 1.0 / g
-        moved = R @ E @ R.T
-        change = -K @ moved
-        if gauge == "full":
-            change = -K @ (0.5 * (moved + moved.T))
-        else:
-            angle = np.linalg.solve(turns, -_conditions(change, gauge))
-            change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
+        change = -K @ R @ E @ R.T
+        angle = np.linalg.solve(turns, -_conditions(change, gauge))
+        change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
         columns.append(change.ravel())
     return np.stack(columns, axis=1)
 
@@ -171,7 +171,7 @@ def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
 def _conditions(change: Float, gauge: str) -> Float:
     """Return what must vanish for a change of K to stay in the gauge, shape (3,)."""
     above, below = change[[0, 0, 1], [1, 2, 2]], change[[1, 2, 2], [0, 0, 1]]
-    return {"lower": above, "upper": below}.get(gauge, above - below)
+    return {"lower": above, "upper": below, "symmetric": above - below}[gauge]
 
 
 def _skew(axis: Float) -> Float:

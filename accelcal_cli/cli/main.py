@@ -11,7 +11,18 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import apply, benchmark, calibrate, export, optimizers, simulate, verify
+from accelcal_cli.cli import (
+    apply,
+    benchmark,
+    calibrate,
+    compare,
+    detect,
+    export,
+    optimizers,
+    reproduce,
+    simulate,
+    verify,
+)
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -46,10 +57,13 @@ app = typer.Typer(
 )
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
+app.command("detect")(detect.command)
 app.command("apply")(apply.command)
 app.command("export")(export.command)
 app.command("verify")(verify.command)
 app.command("benchmark")(benchmark.command)
+app.command("compare")(compare.command)
+app.command("reproduce")(reproduce.command)
 app.command("optimizers")(optimizers.command)
 
 

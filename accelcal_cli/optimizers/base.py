@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -64,6 +65,11 @@ class Optimizer(ABC):
         """Refuse a setting outside its range."""
         check(self)
 
+    @property
+    def crowd(self) -> int:
+        """Points of one run that pass through the memory in a step: how many runs make a block that fits the cache."""
+        return self.population
+
     def suits(self, problem: Problem) -> bool:
         """Whether `problem` offers what this optimizer needs."""
         return all(getattr(problem, f"has_{need}") for need in self.needs)
@@ -112,8 +118,13 @@ def best_of(x: Float, fx: Float) -> Float:
 
 def integers(u: Float, *below: int) -> Int:
     """Return integers, shape (R, C, P), from uniform numbers, shape (R, P, C); column c is in 0 .. below[c] - 1."""
-    whole: Int = (u.transpose(0, 2, 1) * np.array(below)[:, None]).astype(np.intp)
+    whole: Int = (u.transpose(0, 2, 1) * _column(below)).astype(np.intp)
     return whole
+
+
+@cache
+def _column(values: tuple[int, ...]) -> Float:
+    return np.array(values, dtype=float)[:, None]
 
 
 def partners(picks: Int) -> tuple[Int, Int]:
