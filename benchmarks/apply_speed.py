@@ -1,4 +1,4 @@
-"""Applying a result to a 24-hour log against polars reading and writing it: `python -m benchmarks.apply_speed`."""
+"""Applying a result to a long CSV against polars reading and writing it: `python -m benchmarks.apply_speed`."""
 
 from __future__ import annotations
 

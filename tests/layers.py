@@ -33,7 +33,7 @@ ONLY_IN = {
 }
 """Third-party packages and the units that may know them."""
 
-HEAVY = ("scipy", "polars", "boule", "matplotlib", "dask")
+HEAVY = ("scipy", "polars", "boule", "matplotlib", "dask", "jinja2", "serial")
 """Packages that are imported where they are used, never when a module is loaded."""
 
 LATE = {

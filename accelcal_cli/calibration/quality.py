@@ -142,17 +142,17 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
     variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
     touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
     sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
-    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}.get(
-        gauge, np.zeros((3, 3))
-    )
-    return np.where(exact, 0.0, sigma_K), sigma_D  # a zero of the gauge has no error
+    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
+    # A zero of the gauge has no error.
+    return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
 
 
 def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
     """Return d K / d parameters, shape (9, 6): the entries of K_a in a gauge by the first six of the nine parameters.
 
     A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
-    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions.
+    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
+    W leaves the body frame unturned.
     """
     R = np.linalg.solve(K, K_lower)
     skew = [_skew(axis) for axis in np.eye(3)]
@@ -161,9 +161,11 @@ def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
     for i, j in ROWS_COLUMNS[:6]:
         E = np.zeros((3, 3))
         E[i, j] = 1.0 / g
-        change = -K @ R @ E @ R.T
-        angle = np.linalg.solve(turns, -_conditions(change, gauge))
-        change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
+        moved = R @ E @ R.T
+        change = -0.5 * K @ (moved + moved.T)
+        if gauge != "full":
+            angle = np.linalg.solve(turns, -_conditions(change, gauge))
+            change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
         columns.append(change.ravel())
     return np.stack(columns, axis=1)
 
@@ -171,7 +173,7 @@ def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
 def _conditions(change: Float, gauge: str) -> Float:
     """Return what must vanish for a change of K to stay in the gauge, shape (3,)."""
     above, below = change[[0, 0, 1], [1, 2, 2]], change[[1, 2, 2], [0, 0, 1]]
-    return {"lower": above, "upper": below, "symmetric": above - below}[gauge]
+    return {"lower": above, "upper": below}.get(gauge, above - below)
 
 
 def _skew(axis: Float) -> Float:

@@ -51,7 +51,8 @@ class Dop:
 
 @dataclass(frozen=True)
 class PoseFit:
-    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual."""
+    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual;
+    |f| - g before calibration, and the unit direction of the specific force, gauge `lower`."""
 
     pose: int
     where: str
@@ -59,6 +60,8 @@ class PoseFit:
     studentised: float
     leverage: float
     left_out: float
+    residual_before: float
+    direction: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ class Calibration:
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9).
+        information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
         poses: J; freedom: J - 9.
@@ -109,6 +113,7 @@ class Calibration:
     noise_ratio: float | None
     noise_chance: float | None
     covariance: Float
+    information: Float
     nominal_scale: Float
     nominal_bias: Float
     poses: int
@@ -174,10 +179,11 @@ SHAPES = {
     "K_A": (3, 3),
     "f_0": (3,),
     "covariance": (9, 9),
+    "information": (9, 9),
     "nominal_scale": (3,),
     "nominal_bias": (3,),
 }
-WHOLE = ("K_a", "D_a", "K_A", "f_0")
+WHOLE = ("K_a", "D_a", "K_A", "f_0", "information")
 """Arrays in which a missing number is a fault of the file."""
 
 CHOICES = {"gauge": GAUGES, "verdict": get_args(Verdict)}
@@ -218,15 +224,19 @@ def _rebuild(name: str, value: Any) -> Any:
         }
         return Dop(**kinds, parameters=parameters)
     if name == "poses_fit":
-        rows: list[dict[str, Any]] = [
-            {k: math.nan if v is None else v for k, v in row.items()} for row in value
-        ]
-        return tuple(PoseFit(**row) for row in rows)
+        return tuple(_pose_fit(row) for row in value)
     if name == "convergence":
         return tuple((int(n), float(cost)) for n, cost in value)
     if name in NUMBERS_OR_NAN:
         return records.or_nan(value)
     return tuple(value) if isinstance(value, list) else value
+
+
+def _pose_fit(row: Mapping[str, Any]) -> PoseFit:
+    """Return one pose; a key too many or too few is a TypeError."""
+    direction = records.array(row["direction"], (3,), whole=True)
+    known: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
+    return PoseFit(**{**known, "direction": tuple(direction.tolist())})
 
 
 def _matrix(name: str, value: Any) -> Float:

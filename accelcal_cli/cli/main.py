@@ -18,7 +18,10 @@ from accelcal_cli.cli import (
     compare,
     detect,
     export,
+    navigate,
     optimizers,
+    plan,
+    report,
     reproduce,
     simulate,
     verify,
@@ -59,12 +62,15 @@ app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
 app.command("detect")(detect.command)
 app.command("apply")(apply.command)
-app.command("export")(export.command)
 app.command("verify")(verify.command)
+app.command("plan")(plan.command)
+app.command("report")(report.command)
+app.command("export")(export.command)
 app.command("benchmark")(benchmark.command)
 app.command("compare")(compare.command)
 app.command("reproduce")(reproduce.command)
 app.command("optimizers")(optimizers.command)
+app.command("navigate")(navigate.command)
 
 
 def _version(wanted: bool) -> None:

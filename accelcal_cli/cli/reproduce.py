@@ -48,6 +48,11 @@ def command(
         _list(reproduce.catalogue(), format, [raw, plot, cluster, runs, seed])
         return
     running.check_plot(plot)
+    if name in reproduce.voyages():
+        from accelcal_cli.cli import navigate
+
+        navigate.reproduce(name, runs, seed, raw, jobs, cluster, resume, plot, format, quiet)
+        return
     experiment = reproduce.load(name).changed(runs, seed)
     records = running.run(experiment.study(), raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     _show(experiment, records, format)

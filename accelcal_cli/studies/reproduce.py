@@ -31,14 +31,23 @@ Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
 
 
 def names() -> list[str]:
-    """Return the experiments by name."""
-    return list(shipped(STUDY_KIND))
+    """Return the experiments on optimizers by name."""
+    return [name for name in shipped(STUDY_KIND) if name not in voyages()]
+
+
+def voyages() -> list[str]:
+    """Return the experiments on navigation filters by name; studies.navigation runs them."""
+    return [name for name, path in shipped(STUDY_KIND).items() if "filters" in load_mapping(path)]
 
 
 def catalogue() -> Table:
     """Return the experiments and what they repeat."""
-    rows = tuple((name, (found := load(name)).title, found.source) for name in names())
-    return Table("Experiments", (Column("name"), Column("title"), Column("source")), rows)
+    rows = [(name, (found := load(name)).title, found.source) for name in names()]
+    files = shipped(STUDY_KIND)
+    for name in voyages():
+        content = load_mapping(files[name])
+        rows.append((name, content["title"], content["source"]))
+    return Table("Experiments", (Column("name"), Column("title"), Column("source")), tuple(sorted(rows)))
 
 
 def load(name: str) -> Experiment:

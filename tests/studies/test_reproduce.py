@@ -81,19 +81,19 @@ def test_runs_and_seed_can_be_changed():
 def test_parts_number_their_cells_through():
     experiment = reproduce.load("ifoa-calibration").changed(2, None)
     study = experiment.study()
-    first, second = experiment.parts
-    assert study.cells == len(first.optimizers) + len(second.optimizers)
+    first, second, third = experiment.parts
+    last = len(first.optimizers) + len(second.optimizers) - 1
+    assert study.cells == last + 1 + len(third.optimizers)
     assert study.names(0) == {"part": first.title, "function": "calibration", "optimizer": "Newton"}
-    assert study.names(study.cells - 1)["optimizer"] == "several radii"
-    assert study.names(study.cells - 1)["part"] == second.title
+    assert (study.names(last)["part"], study.names(last)["optimizer"]) == (second.title, "several radii")
+    assert study.names(last + 1)["part"] == third.title
     assert [task.cell for task in study.tasks()] == list(range(study.cells))
-    last = study.cells - 1
     records = study.execute(Task(last, 0, 2))
     assert {r.cell for r in records} == {last}
-    own = experiment.parts[1].study().execute(Task(1, 0, 2))
+    own = second.study().execute(Task(1, 0, 2))
     assert [r.cost for r in records] == [r.cost for r in own]
     assert [r.cell for r in study.records_of(1, records)] == [1, 1]
-    assert study.records_of(0, records) == []
+    assert study.records_of(0, records) == study.records_of(2, records) == []
 
 
 def test_raw_results_name_part_function_and_optimizer():

@@ -1,7 +1,8 @@
 """The IMU file of Kalibr, model scale-misalignment.
 
 Kalibr's model of a reading is M a + b with a lower triangular M (kalibr_imu_camera_calibration,
-IccScaledMisalignedImu): M is K_a in gauge `lower`, b is D_a. Kalibr itself estimates b anew in every run; the key is for other readers.
+IccScaledMisalignedImu):
+M is K_a in gauge `lower`, b is D_a. Kalibr itself estimates b anew in every run; the key is for other readers.
 """
 
 from __future__ import annotations
