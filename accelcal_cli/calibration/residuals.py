@@ -107,11 +107,10 @@ def examine(
         weighted_sum += float(np.sum(scaled * scaled))
         kept = _worst(scaled) if readings.poses > KEPT else np.arange(len(e))
         parts.append((first + kept, scaled[kept], w[kept], f[kept], e_before[kept]))
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    if readings.poses > KEPT:
-        kept = np.sort(_worst(columns[1]))
-        columns = [column[kept] for column in columns]
-    residuals = _judge(*columns, g, cofactor, weighted_sum, readings.poses - 9)
+    pose, scaled, w, f, e_before = (np.concatenate(column) for column in zip(*parts, strict=True))
+    kept = np.sort(_worst(scaled)) if readings.poses > KEPT else np.arange(len(pose))
+    chosen = pose[kept], scaled[kept], w[kept], f[kept], e_before[kept]
+    residuals = _judge(*chosen, g, cofactor, weighted_sum, readings.poses - 9)
     return Fit(
         float(np.sqrt(after_sum / readings.poses)), float(np.sqrt(before_sum / readings.poses)), residuals
     )
