@@ -63,6 +63,12 @@ def rows(matrix: Float) -> list[list[float]]:
     return [[float(v) for v in row] for row in np.atleast_2d(matrix)]
 
 
+def force_already(result: Calibration) -> bool:
+    """Whether the readings are specific force already, in the unit of the result."""
+    scale = np.diagonal(result.K_a)
+    return bool(NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1])
+
+
 def in_metres(result: Calibration, target: Target, name: str) -> ErrorModel:
     """Return the sensor for a target whose readings are in m/s^2 before they are corrected.
 
@@ -74,8 +80,8 @@ def in_metres(result: Calibration, target: Target, name: str) -> ErrorModel:
     metres = STANDARD_GRAVITY if result.unit == "g" else 1.0  # how much one unit of f is in m/s^2
     if target.driver_scale is not None:
         return ErrorModel(result.K_a / metres / target.driver_scale, result.D_a / target.driver_scale)
-    scale = np.diagonal(result.K_a)
-    if not (NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1]):
+    if not force_already(result):
+        scale = np.diagonal(result.K_a)
         raise UsageError(
             f"--to {name}: corrects readings in m/s^2, and these are in output units, {scale.mean():.6g} of them to "
             f"1 {result.unit}; state with --driver-scale how many the driver takes for 1 m/s^2"

@@ -11,7 +11,7 @@ import json
 import numpy as np
 
 from accelcal_cli.calibration.exporters import base
-from accelcal_cli.calibration.exporters.base import NEAR_ONE, Export, Target
+from accelcal_cli.calibration.exporters.base import Export, Target
 from accelcal_cli.calibration.result import Calibration
 
 FORMAT = "2.0.0"
@@ -20,13 +20,12 @@ FORMAT = "2.0.0"
 def export(result: Calibration, target: Target) -> Export:  # noqa: ARG001  # one signature for all
     """Return a Ferraris calibration: K_a diagonal, R_a = K_a^-1 times the whole matrix, b_a the bias."""
     scale = np.diagonal(result.K_a)
-    force_already = NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1]
     record = {
         "cal_type": "Ferraris",
         "_format_version": FORMAT,
         "acc_unit": result.unit,
         "gyr_unit": "deg/s",
-        "from_acc_unit": result.unit if force_already else "a.u.",
+        "from_acc_unit": result.unit if base.force_already(result) else "a.u.",
         "from_gyr_unit": "deg/s",
         "comment": "; ".join([*base.origin(result), "gyroscope not calibrated: identity"]),
         "K_a": base.rows(np.diag(scale)),

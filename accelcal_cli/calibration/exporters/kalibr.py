@@ -10,7 +10,6 @@ from __future__ import annotations
 from accelcal_cli.calibration.exporters import base
 from accelcal_cli.calibration.exporters.base import Export, Target
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
 UNKNOWN = """\
   # PLACEHOLDERS: a static calibration does not know them. Take them from the data sheet or an Allan deviation.
@@ -25,16 +24,13 @@ UNKNOWN = """\
 
 def export(result: Calibration, target: Target) -> Export:
     """Return imuN with accelerometers.M and .b; noise, rate and topic are marked placeholders."""
-    if target.driver_scale is None:
-        metres = STANDARD_GRAVITY if result.unit == "g" else 1.0
-        K, D, unit = result.K_a / metres, result.D_a, "unit of the readings"
+    if target.driver_scale is not None or base.force_already(result):
+        model, unit = base.in_metres(result, target, "kalibr").in_gauge("lower"), "m/s^2"
     else:
-        model = base.in_metres(result, target, "kalibr")
-        K, D, unit = model.K, model.D, "m/s^2"
-    model = result.model.__class__(K, D).in_gauge("lower")
+        model, unit = result.model.in_gauge("lower"), "unit of the readings"
     said = [
         *base.origin(result),
-        f"Kalibr: reading = M a + b; a in m/s^2, b in the {unit}, M lower triangular (gauge lower).",
+        f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular (gauge lower).",
     ]
     matrix = "".join(f"    - {row}\n" for row in base.rows(model.K))
     text = (
