@@ -42,9 +42,16 @@ S = TypeVar("S", bound=State)
 
 
 def take(state: S, index: Int) -> S:
-    """Return the state of the runs at `index`; every array field has the runs as its first axis."""
+    """Return the state of the runs at `index`; every array in it and its parts has the runs as its first axis."""
     parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
-    return dataclasses.replace(state, **{k: v[index] for k, v in parts.items() if isinstance(v, np.ndarray)})
+    return dataclasses.replace(state, **{k: _taken(v, index) for k, v in parts.items()})
+
+
+def _taken(part: Any, index: Int) -> Any:
+    if isinstance(part, np.ndarray):
+        return part[index]
+    held: Any = part if dataclasses.is_dataclass(part) else None
+    return part if held is None else take(held, index)
 
 
 @dataclass(frozen=True)
