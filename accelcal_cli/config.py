@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.registry import build
@@ -46,12 +49,7 @@ def load_mapping(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: unreadable, not UTF-8, not YAML (line and column named), a key twice, or not a mapping.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+    text = _text(path)
     try:
         content = yaml.load(text, Loader=_UniqueKeys)
     except yaml.MarkedYAMLError as error:
@@ -63,6 +61,32 @@ def load_mapping(path: Path) -> dict[str, Any]:
     if not isinstance(content, Mapping):
         raise ConfigError(f"{path}: expected keys and values (a YAML mapping)")
     return dict(content)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(f"{path}: {reason.lower()}") from None
+
+
+def load_result(path: str | Path) -> Calibration:
+    """Return the calibration of a result file, JSON or YAML whatever its name says.
+
+    Raises:
+        ConfigError: unreadable, or neither JSON nor YAML.
+        DataError: not the record of a calibration; the message names the key.
+    """
+    file = Path(path)
+    text = _text(file)
+    record = None
+    if text.lstrip().startswith("{"):  # YAML 1.1 would take JSON's 1e-05 for text
+        with contextlib.suppress(ValueError):  # flow style YAML, or a fault that the YAML parser can place
+            record = json.loads(text)
+    return Calibration.from_record(load_mapping(file) if record is None else record, str(path))
 
 
 def dump(record: Mapping[str, Any]) -> str:

@@ -58,7 +58,7 @@ def assemble(
     variance = _variance(readings, settings, solution, low, weights, freedom)
     covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
     sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
-    said, seen_first = _first_sight(solution, start, information, seen, readings.poses)
+    said, seen_first, sight = _first_sight(solution, start, information, seen, low, readings.poses)
     suggestions = _suggest(said, seen_first, readings.poses)
     scale_sigma = float(np.sqrt(np.diagonal(covariance)[quality.SCALE]).max()) / g
     ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
@@ -83,13 +83,14 @@ def assemble(
         noise_ratio=ratio,
         noise_chance=chance,
         covariance=covariance,
+        information=said,
         nominal_scale=np.diagonal(before_model.K).copy(),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=readings.poses,
         evaluations=solution.evaluations,
         runs=settings.runs,
         runs_agreeing=solution.agreeing,
-        poses_fit=_pose_fits(readings, fit),
+        poses_fit=_pose_fits(readings, fit, low, sight),
         outliers=tuple(int(j) for j in outliers(fit.poses, readings.poses, freedom)),
         convergence=_curve(solution),
         optimizer=settings.optimizer,
@@ -118,19 +119,20 @@ def _variance(
 
 
 def _first_sight(
-    solution: Solution, start: Start, information: Float, seen: Observability, poses: int
-) -> tuple[Float, Observability]:
-    """Return the information and observability that the verdict is explained with.
+    solution: Solution, start: Start, information: Float, seen: Observability, low: ErrorModel, poses: int
+) -> tuple[Float, Observability, ErrorModel]:
+    """Return the information, the observability and the sensor that the verdict is explained with.
 
     Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
     nearest sphere then sees the attitudes better than the fit does.
     """
     if start.source != "sphere":
-        return information, seen
-    nine, point = lower_problem(solution.problem, model_at(solution.problem, np.zeros_like(solution.x)))
+        return information, seen, low
+    sphere = model_at(solution.problem, np.zeros_like(solution.x))
+    nine, point = lower_problem(solution.problem, sphere)
     said = quality.information(nine, point)[0]
     first = Observability.of(said, poses)
-    return (said, first) if first.verdict == "undetermined" else (information, seen)
+    return (said, first, sphere) if first.verdict == "undetermined" else (information, seen, low)
 
 
 def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:
@@ -199,8 +201,10 @@ def _dop(seen: Observability) -> Dop:
     )
 
 
-def _pose_fits(readings: Readings, fit: Fit) -> tuple[PoseFit, ...]:
+def _pose_fits(readings: Readings, fit: Fit, low: ErrorModel, sight: ErrorModel) -> tuple[PoseFit, ...]:
     r = fit.poses
+    force = sight.specific_force(low.output(r.force))
+    directions = (force / np.linalg.norm(force, axis=1, keepdims=True)).tolist()
     return tuple(
         PoseFit(
             int(j),
@@ -209,6 +213,8 @@ def _pose_fits(readings: Readings, fit: Fit) -> tuple[PoseFit, ...]:
             float(r.studentised[i]),
             float(r.leverage[i]),
             float(r.left_out[i]),
+            float(r.before[i]),
+            tuple(directions[i]),
         )
         for i, j in enumerate(r.pose)
     )

@@ -27,7 +27,8 @@ class PoseResiduals:
 
     Attributes:
         pose: their numbers, from 0, shape (k,).
-        error: |f| - g, m/s^2, shape (k,).
+        error, before: |f| - g after and before calibration, m/s^2, shape (k,).
+        force: calibrated specific force, gauge `lower`, m/s^2, shape (k, 3).
         leverage: part of the pose's own residual that the fit absorbs, shape (k,).
         studentised: residual over its standard deviation from the other poses, shape (k,).
         left_out: |f| - g, m/s^2, that a fit without the pose would show, shape (k,), to first order.
@@ -35,6 +36,8 @@ class PoseResiduals:
 
     pose: Int
     error: Float
+    before: Float
+    force: Float
     leverage: Float
     studentised: Float
     left_out: Float
@@ -63,8 +66,14 @@ def modulus_errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[
 
 def square_error(e: Float, g: float) -> float:
     """Return the sum of (|f| - g)^2 in (m/s^2)^2 from e, shape (B,)."""
-    error = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
+    error = length_error(e, g)
     return float(np.sum(error * error))
+
+
+def length_error(e: Float, g: float) -> Float:
+    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, both of shape (B,)."""
+    error: Float = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
+    return error
 
 
 def examine(
@@ -87,7 +96,7 @@ def examine(
         robust: the weight that a robust fit gave a weighted residual, m/s^2; None after least squares.
     """
     after_sum, before_sum, weighted_sum = 0.0, 0.0, 0.0
-    parts: list[tuple[Int, Float, Float, Float]] = []
+    parts: list[tuple[Int, Float, Float, Float, Float]] = []
     uncalibrated = modulus_errors(readings, before, g)
     for (first, e, f), (_, e_before, _) in zip(modulus_errors(readings, model, g), uncalibrated, strict=True):
         w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
@@ -98,12 +107,12 @@ def examine(
         scaled = np.sqrt(w) * e
         weighted_sum += float(np.sum(scaled * scaled))
         kept = _worst(scaled) if readings.poses > KEPT else np.arange(len(e))
-        parts.append((first + kept, scaled[kept], w[kept], f[kept]))
-    pose, scaled, w, f = (np.concatenate(column) for column in zip(*parts, strict=True))
+        parts.append((first + kept, scaled[kept], w[kept], f[kept], e_before[kept]))
+    pose, scaled, w, f, before_e = (np.concatenate(column) for column in zip(*parts, strict=True))
     if readings.poses > KEPT:
         kept = np.sort(_worst(scaled))
-        pose, scaled, w, f = pose[kept], scaled[kept], w[kept], f[kept]
-    residuals = _judge(pose, scaled, w, f, g, cofactor, weighted_sum, readings.poses - 9)
+        pose, scaled, w, f, before_e = (column[kept] for column in (pose, scaled, w, f, before_e))
+    residuals = _judge(pose, scaled, w, f, before_e, g, cofactor, weighted_sum, readings.poses - 9)
     return Fit(
         float(np.sqrt(after_sum / readings.poses)), float(np.sqrt(before_sum / readings.poses)), residuals
     )
@@ -115,7 +124,15 @@ def _worst(scaled: Float) -> Int:
 
 
 def _judge(
-    pose: Int, scaled: Float, w: Float, f: Float, g: float, cofactor: Float, weighted_sum: float, freedom: int
+    pose: Int,
+    scaled: Float,
+    w: Float,
+    f: Float,
+    e_before: Float,
+    g: float,
+    cofactor: Float,
+    weighted_sum: float,
+    freedom: int,
 ) -> PoseResiduals:
     """Return residuals with their leverage, studentised and with the pose left out.
 
@@ -130,7 +147,8 @@ def _judge(
     if freedom >= 2:
         others = np.maximum(weighted_sum - scaled**2 / room, 0.0) / (freedom - 1)
         studentised = -scaled / np.sqrt(np.where(others > 0, others, np.nan) * room)
-    return PoseResiduals(pose, size - g, leverage, studentised, (size - g) / room)
+    before = length_error(e_before, g)
+    return PoseResiduals(pose, size - g, before, f, leverage, studentised, (size - g) / room)
 
 
 def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:

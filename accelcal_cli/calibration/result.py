@@ -9,8 +9,9 @@ from typing import Any, get_args
 
 import numpy as np
 
+from accelcal_cli.calibration import record as records
 from accelcal_cli.calibration.quality import Verdict
-from accelcal_cli.errors import DataError
+from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.model import GAUGES, ErrorModel
 from accelcal_cli.streams import Float
 
@@ -50,7 +51,8 @@ class Dop:
 
 @dataclass(frozen=True)
 class PoseFit:
-    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual."""
+    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual;
+    |f| - g before calibration, and the unit direction of the specific force, gauge `lower`."""
 
     pose: int
     where: str
@@ -58,6 +60,8 @@ class PoseFit:
     studentised: float
     leverage: float
     left_out: float
+    residual_before: float
+    direction: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,7 @@ class Calibration:
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9).
+        information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
         poses: J; freedom: J - 9.
@@ -108,6 +113,7 @@ class Calibration:
     noise_ratio: float | None
     noise_chance: float | None
     covariance: Float
+    information: Float
     nominal_scale: Float
     nominal_bias: Float
     poses: int
@@ -135,9 +141,21 @@ class Calibration:
         """Unit of the specific force: g when the readings were calibrated against g = 1."""
         return "g" if self.g == 1.0 else "m/s^2"
 
+    def check_determined(self, name: str, *, force: bool = False) -> None:
+        """Refuse to be used where the poses left parameters undetermined, unless forced.
+
+        Raises:
+            UsageError: the verdict is undetermined; `name` is named in the message.
+        """
+        if self.verdict == "undetermined" and not force:
+            why = f" ({self.reasons[0].rstrip('.')})" if self.reasons else ""
+            raise UsageError(
+                f"{name}: its verdict is undetermined{why}; calibrate anew, or use it with --force"
+            )
+
     def record(self) -> dict[str, Any]:
         """Return the record as plain mappings, lists, numbers and text; NaN and inf become None."""
-        plain: dict[str, Any] = _plain(self)
+        plain: dict[str, Any] = records.plain(self)
         return plain
 
     @classmethod
@@ -152,10 +170,7 @@ class Calibration:
         missing = [f.name for f in fields(cls) if f.name not in record]
         if missing:
             raise DataError(f"{where}: not a whole calibration result; missing: {', '.join(missing)}")
-        try:
-            return cls(**{f.name: _rebuild(f.name, record[f.name]) for f in fields(cls)})
-        except (TypeError, ValueError, KeyError, AttributeError) as error:
-            raise DataError(f"{where}: not a calibration result: {error}") from None
+        return cls(**{f.name: _checked(f.name, record[f.name], where) for f in fields(cls)})
 
 
 SHAPES = {
@@ -164,73 +179,68 @@ SHAPES = {
     "K_A": (3, 3),
     "f_0": (3,),
     "covariance": (9, 9),
+    "information": (9, 9),
     "nominal_scale": (3,),
     "nominal_bias": (3,),
 }
-WHOLE = ("K_a", "D_a", "K_A", "f_0")
+WHOLE = ("K_a", "D_a", "K_A", "f_0", "information")
 """Arrays in which a missing number is a fault of the file."""
 
 CHOICES = {"gauge": GAUGES, "verdict": get_args(Verdict)}
 NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
 
+KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+    **dict.fromkeys(("freedom", "poses", "evaluations", "runs", "runs_agreeing"), ((int,), "a whole number")),
+    **dict.fromkeys(("reasons", "suggestions", "notes", "outliers", "poses_fit"), ((list,), "a list")),
+    **dict.fromkeys(("data", "settings"), ((dict,), "a mapping")),
+    **dict.fromkeys(("before", "optimizer", "version"), ((str,), "text")),
+    **dict.fromkeys(("noise_ratio", "noise_chance"), ((int, float, type(None)), "a number")),
+}
+
+
+def _checked(name: str, value: Any, where: str) -> Any:
+    try:
+        return _rebuild(name, value)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise DataError(f"{where}: not a calibration result: {name}: {reason}") from None
+
 
 def _rebuild(name: str, value: Any) -> Any:
     if name in SHAPES:
-        return _array(name, value, SHAPES[name], whole=name in WHOLE)
+        return _matrix(name, value)
+    if name in KINDS:
+        records.of_kind(value, *KINDS[name])
     if name == "sigma":
-        return Sigma(_array("sigma K_a", value["K_a"], (3, 3)), _array("sigma D_a", value["D_a"], (3,)))
+        return Sigma(records.array(value["K_a"], (3, 3)), records.array(value["D_a"], (3,)))
     if name in CHOICES and value not in CHOICES[name]:
-        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(CHOICES[name])}")
-    if name == "g" and not (isinstance(value, int | float) and 0 < value < math.inf):
-        raise ValueError(f"g is {value!r}; expected a positive number")
+        raise ValueError(f"{value!r} is not one of {', '.join(CHOICES[name])}")
+    if name == "g" and not 0 < records.of_kind(value, (int, float), "a positive number") < math.inf:
+        raise ValueError(f"{value!r} where a positive number was expected")
     if name == "dop":
-        parameters = {key: _infinite(v) for key, v in value["parameters"].items()}
-        kinds = {kind: _infinite(value[kind]) for kind in ("misalignment", "scale", "bias", "worst")}
+        parameters = {key: records.or_infinite(v) for key, v in value["parameters"].items()}
+        kinds = {
+            kind: records.or_infinite(value[kind]) for kind in ("misalignment", "scale", "bias", "worst")
+        }
         return Dop(**kinds, parameters=parameters)
     if name == "poses_fit":
-        rows: list[dict[str, Any]] = [
-            {k: math.nan if v is None else v for k, v in row.items()} for row in value
-        ]
-        return tuple(PoseFit(**row) for row in rows)
+        return tuple(_pose_fit(row) for row in value)
     if name == "convergence":
         return tuple((int(n), float(cost)) for n, cost in value)
     if name in NUMBERS_OR_NAN:
-        return math.nan if value is None else float(value)
+        return records.or_nan(value)
     return tuple(value) if isinstance(value, list) else value
 
 
-def _array(name: str, value: Any, shape: tuple[int, ...], *, whole: bool = False) -> Float:
-    array = np.array(
-        [
-            [math.nan if v is None else v for v in row]
-            if isinstance(row, list)
-            else (math.nan if row is None else row)
-            for row in value
-        ],
-        dtype=float,
-    )
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected {' x '.join(map(str, shape))} numbers")
-    if whole and not np.isfinite(array).all():
-        raise ValueError(f"{name}: a number is missing")
-    return array
+def _pose_fit(row: Mapping[str, Any]) -> PoseFit:
+    """Return one pose; a key too many or too few is a TypeError."""
+    direction = records.array(row["direction"], (3,), whole=True)
+    known: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
+    return PoseFit(**{**known, "direction": tuple(direction.tolist())})
 
 
-def _infinite(value: float | None) -> float:
-    return math.inf if value is None else float(value)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float):  # numpy's too, which YAML does not know
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if hasattr(value, "__dataclass_fields__"):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    return value
+def _matrix(name: str, value: Any) -> Float:
+    found = records.array(value, SHAPES[name], whole=name in WHOLE)
+    if name == "K_a" and np.linalg.matrix_rank(found) < 3:
+        raise ValueError("is singular; expected an invertible matrix")
+    return found

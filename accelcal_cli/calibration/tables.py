@@ -36,9 +36,9 @@ def parameters(result: Calibration) -> Table:
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
     if result.gauge == "full":
         notes.append(
-            "In gauge full a rotation of the body frame is free: of the off-diagonals only K_12/K_11 + K_21/K_22, "
-            "K_13/K_11 + K_31/K_33 and K_23/K_22 + K_32/K_33 are observable, and they alone have a sigma "
-            "(next table)."
+            "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
+            "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
+            "gauge lower and the bias."
         )
     return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
 
@@ -194,6 +194,39 @@ def worst_poses(result: Calibration) -> Table:
         Column(""),
     )
     return Table("Worst poses", columns, rows)
+
+
+def pose_residuals(result: Calibration) -> Table:
+    """Return every kept pose: residual before and after calibration, and the direction that pointed up."""
+    unit = result.unit
+    columns = (
+        Column("pose"),
+        Column("before", unit, ".3e"),
+        Column("after", unit, ".3e"),
+        Column("studentised", format=".2f"),
+        Column("leverage", format=".2f"),
+        *(Column(axis, format=".3f") for axis in AXES),
+    )
+    rows = tuple(
+        (p.where, p.residual_before, p.residual, p.studentised, p.leverage, *p.direction)
+        for p in result.poses_fit
+    )
+    notes = ("Before, after: |f| - g. x, y, z: unit direction of the specific force, gauge lower.",)
+    return Table("Poses", columns, rows, notes)
+
+
+def headline(result: Calibration) -> list[tuple[str, str]]:
+    """Return the few numbers that a reader wants first, name and value."""
+    unit = result.unit
+    worst = f"{result.dop.worst:.3g}" if np.isfinite(result.dop.worst) else "infinite"
+    return [
+        ("rms of |f| - g before", f"{result.rms_before:.3g} {unit}"),
+        ("rms of |f| - g after", f"{result.rms:.3g} {unit}"),
+        ("noise of one pose, s", f"{result.s:.3g} {unit}" if result.freedom > 0 else "-"),
+        ("worst dilution of precision", worst),
+        ("poses", f"{result.poses:,}"),
+        ("local gravity g", f"{result.g:.6g} {unit}"),
+    ]
 
 
 def values(result: Calibration) -> Table:

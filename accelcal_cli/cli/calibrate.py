@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,9 +26,7 @@ def command(
             help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input."
         ),
     ],
-    columns: Annotated[
-        str | None, typer.Option(help="The three output columns: names, or numbers from 1, with commas.")
-    ] = None,
+    columns: options.Columns = None,
     g: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
@@ -90,7 +87,7 @@ def command(
     options.check_format(format)
     options.check_input(data)
     _check_output(output, format)
-    _check_tolerance(tolerance)
+    options.check_tolerance(tolerance)
     stated_g = options.gravity(g, latitude, height)
     overrides: dict[str, Any] = {
         "optimizer": optimizer,
@@ -126,7 +123,7 @@ def command(
     if raw:
         readings = detecting.find_poses(data, columns, chosen, settings.g).readings()
     else:
-        readings = read_readings(data, _columns(columns), stdin=sys.stdin.buffer)
+        readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     result = calibrate(readings, settings)
     _show(result, format, output, quiet)
     if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
@@ -140,15 +137,6 @@ def command(
         raise typer.Exit(BAD_VERDICT)
     if result.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
-
-
-def _columns(text: str | None) -> list[str] | None:
-    return None if text is None else [part.strip() for part in text.split(",")]
-
-
-def _check_tolerance(tolerance: float | None) -> None:
-    if tolerance is not None and not (math.isfinite(tolerance) and tolerance > 0):
-        raise UsageError(f"--tolerance {tolerance:g}: expected a positive number in m/s^2")
 
 
 def _check_output(output: str | None, format: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Annotated
 
@@ -25,6 +26,10 @@ Latitude = Annotated[
 ]
 Height = Annotated[
     float | None, typer.Option("--height", help="Metres above the ellipsoid, with --latitude.")
+]
+Columns = Annotated[
+    str | None,
+    typer.Option("--columns", help="The three output columns: names, or numbers from 1, with commas."),
 ]
 
 
@@ -58,3 +63,14 @@ def gravity(g: float | None, latitude: float | None, height: float | None) -> fl
     if g is not None:
         return check_gravity(g)
     return None if latitude is None else normal_gravity(latitude, height or 0.0)
+
+
+def check_tolerance(tolerance: float | None) -> None:
+    """Raise UsageError when a stated tolerance is not a positive number."""
+    if tolerance is not None and not (math.isfinite(tolerance) and tolerance > 0):
+        raise UsageError(f"--tolerance {tolerance:g}: expected a positive number in m/s^2")
+
+
+def split_columns(text: str | None) -> list[str] | None:
+    """Return the columns named with commas, or None when none were named."""
+    return None if text is None else [part.strip() for part in text.split(",")]

@@ -65,6 +65,11 @@ class Optimizer(ABC):
         """Refuse a setting outside its range."""
         check(self)
 
+    @property
+    def crowd(self) -> int:
+        """Points of one run that pass through the memory in a step: how many runs make a block that fits the cache."""
+        return self.population
+
     def suits(self, problem: Problem) -> bool:
         """Whether `problem` offers what this optimizer needs."""
         return all(getattr(problem, f"has_{need}") for need in self.needs)

@@ -96,7 +96,7 @@ def minimize(
         progress: called with (steps done, steps at most) of all runs together, now and then.
     """
     numbers = np.arange(runs) if isinstance(runs, int) else np.asarray(runs, dtype=np.int64)
-    size = max(1, BLOCK_BYTES // (8 * optimizer.population * problem.dimensions))
+    size = max(1, BLOCK_BYTES // (8 * optimizer.crowd * problem.dimensions))
     np.empty(
         1 << 20
     )  # Freed at once: from now on glibc keeps smaller blocks instead of faulting them in anew.

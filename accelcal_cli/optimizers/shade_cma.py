@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.optimizers import cma
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, gather
+from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, gather, integers
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Bool, Float, Int, Streams
@@ -55,6 +55,11 @@ class ShadeCma(Optimizer):
     greed: float = setting(0.2, "part of the population that may lead (p)", above=0, high=1)
     archive: float = setting(1.4, "archive size, part of the population", low=0, high=10)
 
+    @property
+    def crowd(self) -> int:
+        """A quarter of the starting population: it shrinks fast, and phase two lives on many runs at once."""
+        return max(1, self.population // 4)
+
     def init(self, problem: Problem, x: Float, rng: Streams) -> ShadeState:
         """Start with every memory entry at 0.5 and an empty archive."""
         runs, population, dimensions = x.shape
@@ -77,13 +82,15 @@ class ShadeCma(Optimizer):
         population, dimensions = x.shape[1:]
         u = rng.uniform(population, dimensions + 6)
         F, CR = self._draw(state, u[..., 0], u[..., 1], rng)
-        mutant = self._mutants(state, F, u[..., 2:5])
+        trial = self._mutants(state, F, u[..., 2:5])
         # A coordinate outside the box goes halfway between its parent and the wall.
-        mutant = np.where(mutant < problem.lower, 0.5 * (x + problem.lower), mutant)
-        mutant = np.where(mutant > problem.upper, 0.5 * (x + problem.upper), mutant)
-        gene = (u[..., 5] * dimensions).astype(np.intp)
-        take = (u[..., 6:] <= CR[..., None]) | (gene[..., None] == np.arange(dimensions))
-        trial = np.where(take, mutant, x)
+        low, high = problem.limits
+        np.copyto(trial, 0.5 * (x + low), where=trial < low)
+        np.copyto(trial, 0.5 * (x + high), where=trial > high)
+        keep = u[..., 6:] > CR[..., None]
+        gene = integers(u[..., 5:6], dimensions)[:, 0]
+        keep[np.arange(len(x))[:, None], np.arange(population), gene] = False
+        np.copyto(trial, x, where=keep)
         trial_cost = problem.cost(trial)
         better = trial_cost < fx
         gain = np.where(better, fx - trial_cost, 0.0)
@@ -119,8 +126,13 @@ class ShadeCma(Optimizer):
         second += second >= np.minimum(first, own)
         second += second >= np.maximum(first, own)
         both = np.concatenate((x, state.archive), axis=1)
-        weight = F[..., None]
-        return x + weight * (leader - x) + weight * (gather(x, first) - gather(both, second))
+        mutant = gather(x, first)
+        mutant -= gather(both, second)
+        mutant += leader
+        mutant -= x
+        mutant *= F[..., None]
+        mutant += x
+        return mutant
 
     def _learn(self, state: ShadeState, F: Float, CR: Float, gain: Float) -> ShadeState:
         """Write the weighted Lehmer means of the successful F and CR into the next memory entry."""

@@ -18,7 +18,13 @@ from accelcal_cli.table import Table
 PIPE_WIDTH = 160
 """Columns of a table that goes into a pipe or a file, where no terminal sets a limit."""
 
-VERDICT_STYLE = {"good": "bold green", "weak": "bold yellow", "undetermined": "bold red"}
+VERDICT_STYLE = {
+    "good": "bold green",
+    "weak": "bold yellow",
+    "undetermined": "bold red",
+    "unchanged": "bold green",
+    "changed": "bold red",
+}
 
 
 class _Console(Console):

@@ -37,6 +37,17 @@ def corners() -> Float:
     return np.array(list(itertools.product((1.0, -1.0), repeat=3))) / math.sqrt(3.0)
 
 
+def grid(most: int) -> Float:
+    """Return the directions of all integer vectors with components up to `most`, simplest first.
+
+    26 for 1 (faces, edges, corners of a cube), 98 for 2, 290 for 3; shape (C, 3).
+    """
+    rows = [t for t in itertools.product(range(-most, most + 1), repeat=3) if math.gcd(*t) == 1]
+    whole = np.array(sorted(rows, key=lambda t: (max(map(abs, t)), sum(map(abs, t)))), dtype=float)
+    unit: Float = whole / np.linalg.norm(whole, axis=1, keepdims=True)
+    return unit
+
+
 def faces_edges() -> Float:
     """Return 6 faces and the 6 edges (e_i +- e_j)/sqrt 2, i < j, shape (12, 3): the default 12 positions."""
     return np.concatenate([faces(), edges()[[0, 1, 4, 5, 8, 9]]])

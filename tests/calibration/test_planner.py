@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulated import rotation
+from simulated import DPSO, rotation
 
-from accelcal_cli.calibration.planner import PRIOR, dop_after, fixture_directions, next_poses
-from accelcal_cli.calibration.quality import Observability, design
+from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.compress import compress_each
+from accelcal_cli.calibration.lotters import Box, Loetters, pack
+from accelcal_cli.calibration.plan import parameter_table, plan, pose_table, record
+from accelcal_cli.calibration.planner import (
+    FIXTURES,
+    PRIOR,
+    best_poses,
+    candidates,
+    dop_after,
+    fixture_directions,
+    next_poses,
+)
+from accelcal_cli.calibration.quality import PARAMETERS, Observability, design
+from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
+from accelcal_cli.optimizers.minimize import minimize
 from accelcal_cli.sensor import poses
+from accelcal_cli.streams import Streams
 
 
 def _information(u):
@@ -109,3 +127,150 @@ def test_fixture_directions_are_a_cube_with_its_edges_and_corners():
     np.testing.assert_allclose(np.linalg.norm(u, axis=1), 1.0, rtol=1e-14)
     assert len(np.unique(u.round(9), axis=0)) == 26
     assert len({poses.describe(d) for d in u}) == 26
+
+
+KINDS = (quality.SCALE, quality.MISALIGNMENT, quality.BIAS)
+
+
+def _dop(u):
+    return np.sqrt(np.diagonal(np.linalg.inv(_information(u) + PRIOR * np.eye(9))))
+
+
+def _by_kind(dop):
+    """Dilutions sorted within their kind: the axes of a sensor are alike."""
+    return np.concatenate([np.sort(dop[kind]) for kind in KINDS])
+
+
+def _exhaustive(taken, allowed, count):
+    """The least worst dilution that any `count` of the allowed directions reach, with repetition."""
+    rows = design(allowed)
+    outer = np.einsum("ci,cj->cij", rows, rows)
+    base, best = _information(taken) + PRIOR * np.eye(9), np.inf
+    sets = itertools.combinations_with_replacement(range(len(allowed)), count)
+    while block := list(itertools.islice(sets, 20000)):
+        total = base + outer[np.array(block)].sum(axis=1)
+        best = min(best, np.diagonal(np.linalg.inv(total), axis1=1, axis2=2).max(axis=1).min())
+    return np.sqrt(best)
+
+
+@functools.cache
+def _long_search(name, count, starts):
+    """Dilutions of the best set that a quasi-Newton search over all directions finds from several starts."""
+    taken = SETS[name]
+    from scipy.optimize import minimize as descend
+
+    def unit(x):
+        u = x.reshape(count, 3)
+        return u / np.linalg.norm(u, axis=1, keepdims=True)
+
+    def cost(x, power):
+        variance = _dop(np.concatenate([taken, unit(x)])) ** 2
+        return np.log(np.sum((variance / variance.max()) ** power)) / power + np.log(variance.max())
+
+    found = []
+    for x in Streams(5, range(starts)).normal(1, 3 * count)[:, 0]:
+        for power in (2.0, 16.0, 64.0):
+            x = descend(cost, x, (power,), method="BFGS", options={"maxiter": 40}).x
+        found.append(_dop(np.concatenate([taken, unit(x)])))
+    return min(found, key=np.max)
+
+
+@pytest.mark.parametrize(("fixture", "directions"), [("edges", 18), ("corners", 26)])
+def test_four_poses_after_the_faces_are_those_of_an_exhaustive_search(fixture, directions):
+    allowed = candidates(fixture)
+    assert len(allowed) == directions
+    chosen = best_poses(_information(poses.faces()), allowed, 4)
+    worst = _dop(np.concatenate([poses.faces(), allowed[chosen]])).max()
+    assert worst == pytest.approx(_exhaustive(poses.faces(), allowed, 4), rel=1e-6)
+
+
+@pytest.mark.parametrize("fixture", ["corners", "any"])
+@pytest.mark.parametrize(("taken", "count"), [("faces", 6), ("none", 12)])
+def test_every_dilution_is_near_that_of_the_best_set_of_a_long_search(taken, count, fixture):
+    u = SETS[taken]
+    allowed = candidates(fixture)
+    chosen = best_poses(_information(u), allowed, count)
+    assert len(chosen) == count
+    reached = _dop(np.concatenate([u, allowed[chosen]]))
+    best = _long_search(taken, count, 6)
+    assert reached.max() <= 1.1 * best.max()
+    assert (_by_kind(reached) <= 1.1 * _by_kind(best)).all()
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 10**6), st.integers(0, 14), st.integers(1, 9))
+def test_an_exchange_is_never_worse_than_the_greedy_choice(seed, taken, count):
+    u = poses.fibonacci(taken + 1) @ rotation(seed)
+    greedy = next_poses(_information(u), fixture_directions(), count)
+    chosen = best_poses(_information(u), fixture_directions(), count)
+    worst = [_dop(np.concatenate([u, fixture_directions()[c]])).max() for c in (chosen, greedy)]
+    assert worst[0] <= worst[1] * (1 + NEAR)
+
+
+def test_poses_come_in_the_order_that_helps_most():
+    allowed = candidates("corners")
+    chosen = best_poses(_information(poses.faces()), allowed, 6)
+    for k in range(5):
+        so_far = np.concatenate([poses.faces(), allowed[chosen[:k]]])
+        worst = [_worst_variance(_information(so_far), allowed[c]) for c in chosen[k:]]
+        assert worst[0] <= min(worst) * (1 + NEAR)
+
+
+def test_fixtures_allow_more_and_more():
+    sizes = [len(candidates(fixture)) for fixture in FIXTURES]
+    assert sizes == [6, 18, 26, 290]
+    for few, many in itertools.pairwise(FIXTURES):
+        np.testing.assert_array_equal(candidates(many)[: len(candidates(few))], candidates(few))
+    whole = candidates("any")
+    np.testing.assert_allclose(np.linalg.norm(whole, axis=1), 1.0, rtol=1e-14)
+    assert len(np.unique(whole.round(9), axis=0)) == 290
+
+
+def test_predicted_sigma_is_the_scatter_of_simulated_calibrations():
+    """Two thousand sensors in the six faces and the six poses that were planned."""
+    g, runs, sigma = 9.8, 2000, 1e-3
+    found = plan(_information(poses.faces()), 6, 6, "corners", sigma / g)
+    u = np.concatenate([poses.faces(), found.directions])
+    truth = DPSO.in_gauge("lower")
+    outputs = truth.output(g * u + sigma * Streams(3, range(runs)).normal(len(u), 3))
+    box = Box(np.repeat((pack(truth.K, truth.D, 9) + 3000.0)[None], runs, axis=0), np.full((runs, 9), 3e4))
+    problem = Loetters(compress_each(outputs), g, box)
+    run = minimize(problem, LevenbergMarquardt(), runs=runs, start=np.zeros((runs, 1, 9)), trace=False)
+    K, D = problem.parameters(run.x)
+    E = np.linalg.solve(truth.K, K) - np.eye(3)
+    bias = (truth.D - D) / np.diagonal(K, axis1=1, axis2=2)
+    scatter = np.concatenate([E[:, [0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1]], bias / g], axis=1).std(axis=0)
+    units = np.repeat([1e6, 1e3, 1e6], 3)  # ppm, mrad, micro-g
+    predicted = np.array([row["sigma_after"] for row in parameter_table(found).records()])
+    np.testing.assert_allclose(predicted, scatter * units, rtol=0.1)
+
+
+def test_a_plan_tells_what_is_expected_after_each_pose():
+    found = plan(_information(poses.faces()), 6, 6, "corners", 1e-4)
+    rows = pose_table(found).records()
+    assert [row["pose"] for row in rows] == list(range(6, 13))
+    assert rows[0]["hold"] == "so far"
+    assert rows[0]["dop_misalignment"] is None
+    for k, row in enumerate(rows[1:], 1):
+        np.testing.assert_array_equal([row["x"], row["y"], row["z"]], found.directions[k - 1])
+        assert row["hold"] == poses.describe(found.directions[k - 1])
+        dop = dop_after(_information(poses.faces()), found.directions[:k]).dop
+        if np.isfinite(dop).all():
+            assert row["dop_misalignment"] == pytest.approx(dop[quality.MISALIGNMENT].max())
+            assert row["sigma_scale"] == pytest.approx(dop[quality.SCALE].max() * 100)
+    assert found.verdict == "good"
+    assert [row["parameter"] for row in parameter_table(found).records()] == list(PARAMETERS)
+    assert record(found)["verdict"] == "good"
+
+
+def test_without_a_noise_there_is_no_sigma():
+    found = plan(np.zeros((9, 9)), 0, 12, "edges", None)
+    assert not [key for row in pose_table(found).records() for key in row if key.startswith("sigma")]
+    assert not [key for row in parameter_table(found).records() for key in row if key.startswith("sigma")]
+
+
+def test_poses_that_cannot_be_enough_are_named_as_such():
+    found = plan(np.zeros((9, 9)), 0, 12, "faces", None)
+    assert found.verdict == "undetermined"
+    assert "misalignment xy, misalignment xz, misalignment yz" in pose_table(found).notes[-1]
+    assert "all nine parameters" in pose_table(plan(np.zeros((9, 9)), 0, 1, "any", None)).notes[-1]

@@ -1,0 +1,283 @@
+"""An old result against new readings: did this sensor change?
+
+The nine gauge-free parameters of quality.PARAMETERS, as force at 1 g, from the new readings minus those of the
+result. Where the new readings do not determine all nine, the directions that they determine are compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli import __version__
+from accelcal_cli.calibration import chances, quality
+from accelcal_cli.calibration import record as records
+from accelcal_cli.calibration.chances import Noise, Pair
+from accelcal_cli.calibration.compress import compress
+from accelcal_cli.calibration.lotters import ROWS_COLUMNS, Box, Loetters, pack
+from accelcal_cli.calibration.quality import PARAMETERS, UNDETERMINED, Observability
+from accelcal_cli.calibration.residuals import modulus_errors, square_error
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.search import polish
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.streams import Bool, Float
+
+SCHEMA = "accelcal/verification/1"
+
+FARTHEST = (0.3, 0.3, 1.0)
+"""Half-widths of the box for the new parameters: scale factors (part), misalignments (rad), biases (parts of g)."""
+
+ROUNDING = 1e-9
+"""Noise below this part of g is rounding: nothing is judged by less."""
+
+TOUCH = 0.1
+"""A parameter is known alone when the undetermined directions have at most this part of it: the axes of a poor sensor
+are not quite those of the cube that it was turned on."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One of the nine parameters, new minus old, m/s^2 at 1 g; NaN where the new readings do not determine it.
+
+    Attributes:
+        name: of quality.PARAMETERS.
+        value, sigma: difference and its one-sigma, old and new uncertainty together.
+        chance: of a difference as large when nothing changed; adjusted: the same, for nine looks (Holm).
+        changed: whether it did, at the level of the test.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    chance: float
+    adjusted: float
+    changed: bool
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The outcome of a comparison. Units: m/s^2 (units of g when g = 1).
+
+    Attributes:
+        verdict: unchanged or changed; `reasons` says why in sentences.
+        chance: that an unchanged sensor looks as different; level: below it the sensor has changed.
+        chi_square: d^T C^-1 d of the determined directions; directions: how many, at most nine; chance_together:
+            of so large a chi-square when nothing changed.
+        differences: parameter by parameter.
+        s_old, s_new: noise of one pose in the old and the new readings; noise_chance: of so different a noise.
+        rms: of |f| - g of the new readings under the old result; tolerance: what it is held to, or None.
+        poses: of the new readings; freedom: their degrees of freedom.
+        g: local gravity; unit: of everything above.
+        result, data: what was compared: source and sha256 of the old readings and of the new.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    chance: float
+    level: float
+    chi_square: float
+    directions: int
+    chance_together: float
+    differences: tuple[Difference, ...]
+    s_old: float
+    s_new: float
+    noise_chance: float
+    rms: float
+    tolerance: float | None
+    poses: int
+    freedom: int
+    g: float
+    unit: str
+    result: dict[str, object]
+    data: dict[str, object]
+    version: str = __version__
+    schema: str = SCHEMA
+
+    @property
+    def passed(self) -> bool:
+        """Whether the sensor is unchanged and within the tolerance."""
+        return self.verdict == "unchanged" and self.within
+
+    @property
+    def within(self) -> bool:
+        """Whether the rms of |f| - g keeps to the tolerance, if there is one."""
+        return self.tolerance is None or self.rms <= self.tolerance
+
+    def record(self) -> dict[str, object]:
+        """Return plain mappings, lists, numbers and text; NaN becomes None."""
+        plain: dict[str, object] = records.plain(self)
+        return plain
+
+
+@dataclass(frozen=True)
+class Shift:
+    """What the new readings say of the nine parameters, relative to the old ones.
+
+    Attributes:
+        value: difference, m/s^2, shape (9,).
+        cofactor: of the new estimate, shape (9, 9).
+        basis: directions that the readings determine, shape (9, r).
+        known: which parameters they determine one by one, shape (9,).
+        noise: variance and degrees of freedom of the new readings.
+    """
+
+    value: Float
+    cofactor: Float
+    basis: Float
+    known: Bool
+    noise: Noise
+
+
+def verify(
+    old: Calibration, readings: Readings, level: float = 0.05, tolerance: float | None = None
+) -> Verification:
+    """Compare a result with new readings of the sensor.
+
+    Args:
+        old: the result.
+        readings: J static poses, in the unit of the readings that the result was made from.
+        level: chance of calling an unchanged sensor changed.
+        tolerance: largest rms of |f| - g, m/s^2, or None.
+
+    Raises:
+        DataError: the result states no uncertainty, so that there is nothing to compare with.
+    """
+    _check(old)
+    model = old.model.in_gauge("lower")
+    found = shift(old, readings)
+    floor = (ROUNDING * old.g) ** 2
+    pair = Pair.of(
+        Noise(max(old.s**2, floor), old.freedom), Noise(max(found.noise.variance, floor), found.noise.freedom)
+    )
+    A = old.covariance / old.s**2
+    V = found.basis.T @ (pair.a.variance * A + pair.b.variance * found.cofactor) @ found.basis
+    d = found.basis.T @ found.value
+    together = pair.chance(d, found.basis.T @ A @ found.basis, found.basis.T @ found.cofactor @ found.basis)
+    single = np.array(
+        [pair.chance(found.value[[p]], A[[p]][:, [p]], found.cofactor[[p]][:, [p]]) for p in range(9)]
+    )
+    chance = chances.combined(np.append(single[found.known], together))
+    squares = sum(square_error(e, old.g) for _, e, _ in modulus_errors(readings, model, old.g))
+    verdict = "changed" if chance < level else "unchanged"
+    differences = _differences(found, pair, A, single, level if verdict == "changed" else 0.0)
+    return Verification(
+        verdict=verdict,
+        reasons=_reasons(verdict, differences, found, pair, level),
+        chance=chance,
+        level=level,
+        chi_square=float(d @ np.linalg.solve(V, d)),
+        directions=found.basis.shape[1],
+        chance_together=together,
+        differences=differences,
+        s_old=old.s,
+        s_new=float(np.sqrt(found.noise.variance)) if found.noise.freedom else float("nan"),
+        noise_chance=pair.noise_chance(),
+        rms=float(np.sqrt(squares / readings.poses)),
+        tolerance=tolerance,
+        poses=readings.poses,
+        freedom=found.noise.freedom,
+        g=old.g,
+        unit=old.unit,
+        result=dict(old.data),
+        data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
+    )
+
+
+def _check(old: Calibration) -> None:
+    source = old.data.get("source", "result")
+    if old.verdict == "undetermined" or not np.isfinite(old.covariance).all():
+        raise DataError(
+            f"the result of {source} has no uncertainty for all nine parameters (verdict {old.verdict}, "
+            f"{old.poses} poses); verify needs one of verdict good or weak with ten poses or more"
+        )
+    if old.freedom < 1 or not old.s > 0:
+        raise DataError(f"the result of {source} states no noise s; verify needs one with ten poses or more")
+
+
+def shift(old: Calibration, readings: Readings) -> Shift:
+    """Return what new readings say of the nine parameters: a fit where they determine all, else one linear step."""
+    problem = _problem(old, readings)
+    start = np.zeros((1, 9))
+    J, e = quality.jacobian(problem, start)[0], problem.residuals(start[:, None])[0, 0] / (2.0 * old.g)
+    values, vectors = np.linalg.eigh(J.T @ J)
+    # A direction with less information has an error above UNDETERMINED times the noise of a pose.
+    seen = values > 1.0 / UNDETERMINED**2
+    if not seen.all() or readings.poses < 9:
+        basis, values = vectors[:, seen], values[seen]
+        inverse = (basis / values) @ basis.T
+        value = -inverse @ (J.T @ e)
+        rest = float(e @ e - (basis.T @ J.T @ e) ** 2 @ (1.0 / values))
+        freedom = readings.poses - int(seen.sum())
+        known = np.einsum("pq,pq->p", basis, basis) > 1.0 - TOUCH**2
+        return Shift(value, inverse, basis, known, Noise(max(rest, 0.0) / max(freedom, 1), freedom))
+    x = polish(problem, start).x
+    variance = float(problem.cost(x[:, None])[0, 0]) / (4.0 * old.g**2) / max(readings.poses - 9, 1)
+    cofactor = Observability.of(quality.information(problem, x)[0], readings.poses).cofactor
+    value = _between(problem, start, x)
+    return Shift(value, cofactor, np.eye(9), np.ones(9, bool), Noise(variance, readings.poses - 9))
+
+
+def _problem(old: Calibration, readings: Readings) -> Loetters:
+    """Return the least-squares problem of the new readings in a wide box about the old parameters."""
+    model = old.model.in_gauge("lower")
+    scale = np.diagonal(model.K)
+    half = np.concatenate(
+        [FARTHEST[0] * scale, np.full(3, FARTHEST[1] * scale.mean()), FARTHEST[2] * old.g * scale]
+    )
+    blocks = ((block, None) for _, block in readings.blocks())
+    triangle = compress(blocks, model.D, old.g * float(scale.mean()))
+    return Loetters(triangle, old.g, Box(pack(model.K, model.D, 9)[None], half[None]))
+
+
+def _between(problem: Loetters, old: Float, new: Float) -> Float:
+    """Return the nine parameters at `new` relative to `old`, both shape (1, 9), m/s^2: K_A = (I + E) K_A0."""
+    (K_0,), (D_0,) = problem.parameters(old)
+    (K,), (D,) = problem.parameters(new)
+    E = np.linalg.solve(K, K_0) - np.eye(3)
+    rows, columns = zip(*ROWS_COLUMNS[:6], strict=True)
+    return np.concatenate([problem.g * E[rows, columns], (D - D_0) / np.diagonal(K_0)])
+
+
+def _differences(found: Shift, pair: Pair, A: Float, single: Float, level: float) -> tuple[Difference, ...]:
+    adjusted = np.full(9, np.nan)
+    adjusted[found.known] = chances.holm(single[found.known])
+    variance = np.diagonal(pair.a.variance * A + pair.b.variance * found.cofactor)
+    sigma = np.where(found.known, np.sqrt(variance), np.nan)
+    value, alone = np.where(found.known, [found.value, single], np.nan)
+    return tuple(
+        Difference(
+            name,
+            float(value[p]),
+            float(sigma[p]),
+            float(alone[p]),
+            float(adjusted[p]),
+            bool(adjusted[p] < level),
+        )
+        for p, name in enumerate(PARAMETERS)
+    )
+
+
+def _reasons(
+    verdict: str, differences: tuple[Difference, ...], found: Shift, pair: Pair, level: float
+) -> tuple[str, ...]:
+    lines = []
+    named = [d.name for d in differences if d.changed]
+    if named:
+        lines.append(f"Changed: {', '.join(named)}.")
+    elif verdict == "changed":
+        lines.append("No single parameter stands out; together they differ by more than chance allows.")
+    lost = [d.name for d in differences if np.isnan(d.value)]
+    if lost:
+        directions = found.basis.shape[1]
+        lines.append(
+            f"The new readings determine {directions} of 9 directions; nothing is said of: {', '.join(lost)}."
+        )
+    if found.noise.freedom < 1:
+        lines.append("The new readings say nothing of their noise; it is taken to be that of the result.")
+    elif pair.noise_chance() < level:
+        ratio = float(np.sqrt(pair.b.variance / pair.a.variance))
+        likely = f"chance {pair.noise_chance():.2g}"
+        lines.append(f"The new readings have {ratio:.2g} times the noise of the old ({likely}).")
+    return tuple(lines)

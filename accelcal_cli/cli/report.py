@@ -1,0 +1,45 @@
+"""`accelcal report`: a result as one self-contained HTML page with pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from accelcal_cli.cli import options
+from accelcal_cli.errors import UsageError
+
+SUFFIXES = (".html", ".htm")
+BAD_VERDICT = 1
+
+
+def command(
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    output: Annotated[str, typer.Option("--output", "-o", help="HTML file; - is standard output.")],
+    title: Annotated[
+        str | None, typer.Option(help="Heading of the page.", show_default="calibration of the readings")
+    ] = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write a report: verdict, parameters with sigma, residuals, poses, dilution, convergence, settings, origin.
+
+    One file without links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the
+    verdict is "undetermined"; the report is written all the same.
+    """
+    from accelcal_cli.config import load_result
+    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.output.report import check_packages, page
+
+    if output != "-" and Path(output).suffix not in SUFFIXES and not Path(output).is_dir():
+        raise UsageError(f'-o "{output}": expected a name that ends in {" or ".join(SUFFIXES)}')
+    check_target(output)
+    check_packages()
+    found = load_result(result)
+    text = page(found, title or f"Calibration of {found.data.get('source', result)}")
+    with whole_file(output) as file:
+        file.write(text)
+    if not quiet and output != "-":
+        typer.echo(f"accelcal: wrote {output}", err=True)
+    if found.verdict == "undetermined":
+        raise typer.Exit(BAD_VERDICT)

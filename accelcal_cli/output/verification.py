@@ -1,0 +1,15 @@
+"""A verification on the terminal: verdict first, then what it rests on."""
+
+from __future__ import annotations
+
+from accelcal_cli.calibration.verify import Verification
+from accelcal_cli.calibration.verify_tables import tables
+from accelcal_cli.output import console as rich_console
+
+
+def show_verification(result: Verification) -> None:
+    """Print a verification to standard output."""
+    out = rich_console.console()
+    rich_console.verdict(result.verdict, result.reasons, out)
+    out.print()
+    rich_console.show(tables(result), out)

@@ -1,0 +1,266 @@
+"""The report: whole, self-contained, the same twice; and what a browser makes of it."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from html.parser import HTMLParser
+
+import chromium
+import numpy as np
+import pytest
+from simulated import MEMS, noise, readings
+
+import accelcal_cli
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.output import pictures
+from accelcal_cli.output.report import page
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.readings import Readings
+
+G = 9.8
+VOID = ("meta", "link", "br")
+
+
+@functools.cache
+def _result(kind):
+    search = {"optimizer": "pso", "parameters": {"population": 20, "iterations": 40}, "g": G}
+    if kind == "good":
+        return calibrate(readings(poses.turns(), sigma=1e-3), Settings(**search))
+    if kind == "outlier":
+        output = MEMS.output(G * poses.fibonacci(40) + noise(40, 1e-3, 2))
+        output[7] += 0.3
+        return calibrate(Readings.from_array(output), Settings(**search, robust="huber"))
+    if kind == "undetermined":
+        return calibrate(readings(np.tile(poses.faces(), (2, 1)), sigma=1e-3), Settings(**search))
+    return calibrate(readings(poses.fibonacci(1200), sigma=1e-3), Settings(**search))
+
+
+KINDS = ("good", "outlier", "undetermined", "many")
+
+
+@functools.cache
+def _page(kind):
+    return page(_result(kind), "Sensor 7")
+
+
+def _drawings(kind):
+    """The pictures of a page by their names."""
+    found = re.findall(r'<svg [^>]*aria-labelledby="(\w+)-alt">.*?</svg>', _page(kind), re.DOTALL)
+    whole = re.findall(r"<svg .*?</svg>", _page(kind), re.DOTALL)
+    return dict(zip(found, whole, strict=True))
+
+
+@pytest.fixture(scope="module")
+def good():
+    return _result("good")
+
+
+class Reader(HTMLParser):
+    """Checks that tags close in order; keeps the tags, the ids and the text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.ids, self.text = [], [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        self.tags.append((tag, found))
+        self.ids += [found["id"]] if "id" in found else []
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        self.ids += [dict(attributes)["id"]] if "id" in dict(attributes) else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data if self.open and self.open[-1] != "style" else ""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_page_is_whole_and_needs_nothing_else(kind):
+    text = _page(kind)
+    seen = Reader(text)
+    assert len(seen.ids) == len(set(seen.ids))
+    tags = [tag for tag, _ in seen.tags]
+    assert not {"script", "img", "iframe", "object", "image"} & set(tags)
+    links = [a.get(key, "") for _, a in seen.tags for key in ("href", "src", "xlink:href")]
+    assert all(link == "" or link.startswith(("#", "data:")) for link in links)
+    assert not re.search(r"url\((?!#)|@import", text)
+    used = re.findall(r"(?:url\(|href=\")#([^\")]+)", text)
+    assert set(used) <= set(seen.ids)
+    assert not re.search(r"\bnan\b", seen.text)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_verdict_comes_first(kind):
+    result = _result(kind)
+    text = re.sub(r"\s+", " ", Reader(_page(kind)).text)
+    assert text.index(f"Verdict: {result.verdict}") < text.index("Parameters")
+    for sentence in (*result.reasons, *result.notes, result.before):
+        assert sentence in text
+
+
+def test_a_page_holds_every_part(good):
+    text = Reader(_page("good")).text
+    for part in (
+        "Sensor 7",
+        good.data["sha256"],
+        f"accelcal {accelcal_cli.__version__}",
+        "accelcal/calibration/1",
+        f"{good.K_a[0, 0]:.8g}",
+        f"{good.sigma.D_a[2]:.2g}",
+        "scale factor error x",
+        "misalignment yz",
+        "population: 20",
+        good.poses_fit[23].where,
+        f"{good.poses_fit[23].residual_before:.3e}",
+        f"{good.dop.worst:.3g}",
+    ):
+        assert part in text, part
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_are_there_with_a_text_and_take_the_colours_of_the_page(kind):
+    drawings = _drawings(kind)
+    assert list(drawings) == ["residuals", "sphere", "dilution", "convergence"]
+    for svg in drawings.values():
+        assert 'role="img"' in svg
+        assert "viewBox" in svg
+        assert len(re.findall(r"<title [^>]*>[^<]{40,}</title>", svg)) == 1
+        assert not re.search(r"#[0-9a-fA-F]{6}\b|font-family", svg)
+        assert "currentColor" in svg
+        assert "var(--" in svg
+
+
+def test_an_outlier_is_marked_in_both_pictures_of_poses():
+    assert _result("outlier").outliers == (7,)
+    assert "outliers (with a cross): 1" in _drawings("outlier")["residuals"]
+    for name in ("residuals", "sphere"):
+        assert "var(--bad)" in _drawings("outlier")[name]
+        assert "var(--bad)" not in _drawings("good")[name]
+
+
+def test_every_table_has_a_caption_and_headings():
+    text = _page("good")
+    tables = re.findall(r"<table>.*?</table>", text, re.DOTALL)
+    assert len(tables) == 6
+    for table in tables:
+        assert table.count("<caption>") == 1
+        assert '<th scope="col"' in table
+        assert '<th scope="row"' in table
+        assert not re.search(r"<th[^>]*></th>", table)
+
+
+def test_without_a_curve_there_is_no_picture_of_it(good):
+    record = {**good.record(), "convergence": []}
+    text = page(Calibration.from_record(record, "r"), "Sensor 7")
+    assert pictures.convergence(Calibration.from_record(record, "r")) == ""
+    assert "Convergence" not in text
+    assert text.count("<svg") == 3
+
+
+def test_the_same_result_gives_the_same_page(good):
+    again = Calibration.from_record(json.loads(json.dumps(good.record())), "r")
+    assert _page("good") == page(again, "Sensor 7")
+
+
+def test_text_of_the_result_is_not_taken_for_html(good):
+    evil = "<script>alert(1)</script>"
+    record = good.record()
+    record |= {"optimizer": evil, "before": evil, "notes": [evil], "reasons": [evil]}
+    record["data"] = {"source": evil, "sha256": evil, "columns": [evil]}
+    record["poses_fit"][0]["where"] = evil
+    text = page(Calibration.from_record(record, "r"), evil)
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 8
+
+
+# In a browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = chromium.browser()
+    if path is None:
+        pytest.skip("no chromium and chromedriver here")
+    with chromium.session(path) as found:
+        yield found
+
+
+BOXES = """
+return [...document.querySelectorAll("svg")].map(svg => {
+  const box = svg.getBoundingClientRect(), style = getComputedStyle(svg);
+  return [box.left, box.right, box.height, svg.querySelectorAll("path, use").length, style.visibility];
+})
+"""
+CONTRAST = """
+const luminance = text => {
+  const [r, g, b] = text.match(/[\\d.]+/g).slice(0, 3).map(v => v / 255)
+    .map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+};
+const behind = node => {
+  for (; node; node = node.parentElement) {
+    const colour = getComputedStyle(node).backgroundColor;
+    if (!/^rgba\\(.*, 0\\)$/.test(colour)) return colour;
+  }
+  return "rgb(255, 255, 255)";
+};
+const all = "h1, h2, p, dt, dd, th, td, caption, figcaption, summary, pre, svg text";
+return [...document.querySelectorAll(all)].map(node => {
+  const style = getComputedStyle(node);
+  const ink = luminance(node.namespaceURI.endsWith("svg") ? style.fill : style.color);
+  const page = luminance(behind(node));
+  return [(Math.max(ink, page) + 0.05) / (Math.min(ink, page) + 0.05), node.textContent.trim()];
+})
+"""
+
+
+@pytest.mark.parametrize("width", [1100, 390])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_browser_shows_it_in_both_schemes_and_on_a_telephone(browser, tmp_path, kind, scheme, width):
+    file = tmp_path / "report.html"
+    file.write_text(_page(kind), encoding="utf-8")
+    browser.requests(), browser.log("browser")
+    browser.open(file, width=width, scheme=scheme)
+    assert browser.requests() == [file.as_uri()]
+    assert browser.log("browser") == []
+    shown = browser.run("return document.body.innerText")
+    assert f"Verdict: {_result(kind).verdict}" in shown
+    assert browser.run("return document.documentElement.scrollWidth") <= width
+    drawings = browser.run(BOXES)
+    assert len(drawings) == 4
+    for left, right, height, marks, visibility in drawings:
+        assert 0 <= left < right <= width
+        assert height > 150
+        assert marks > 20
+        assert visibility == "visible"
+    background = browser.run("return getComputedStyle(document.body).backgroundColor")
+    assert (background == "rgb(255, 255, 255)") == (scheme == "light")
+    low = [(ratio, text) for ratio, text in browser.run(CONTRAST) if ratio < 4.5]
+    assert low == []
+
+
+def test_it_prints_dark_on_white_with_everything_unfolded(browser, tmp_path):
+    file = tmp_path / "report.html"
+    file.write_text(_page("good"), encoding="utf-8")
+    browser.open(file, scheme="dark")
+    features = [{"name": "prefers-color-scheme", "value": "dark"}]
+    browser.devtools("Emulation.setEmulatedMedia", media="print", features=features)
+    style = browser.run("const s = getComputedStyle(document.body); return [s.backgroundColor, s.color]")
+    assert style == ["rgb(255, 255, 255)", "rgb(0, 0, 0)"]
+    assert browser.run("return document.querySelector('details table').getBoundingClientRect().height") > 100
+    browser.print(tmp_path / "report.pdf")
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
+    browser.devtools("Emulation.setEmulatedMedia", media="", features=[])
