@@ -16,7 +16,10 @@ from accelcal_cli.sensor.rewrite import Change, rewrite
 from accelcal_cli.sensor.source import ByteSource
 from accelcal_cli.sensor.tabular import TextTable, open_table
 
-HALF = lambda numbers: numbers[:, :3] / 3.0  # fractions of many digits
+
+def third(numbers):
+    """Return fractions of many digits."""
+    return numbers[:, :3] / 3.0
 
 
 def run(data: bytes, *, replace=False, small=True, wanted=None, monkeypatch=None):
@@ -26,7 +29,7 @@ def run(data: bytes, *, replace=False, small=True, wanted=None, monkeypatch=None
         monkeypatch.setattr(module, "SMALL", 0)
     table = TextTable(ByteSource(io.BytesIO(data), "log.csv", **sizes))
     columns = choose(table, wanted)
-    change = Change(Selection(columns.output), HALF, ("fx", "fy", "fz"), columns.output if replace else ())
+    change = Change(Selection(columns.output), third, ("fx", "fy", "fz"), columns.output if replace else ())
     out = io.BytesIO()
     rewrite(table, change, out)
     return out.getvalue()
@@ -198,7 +201,7 @@ def test_parquet_to_parquet_and_to_text(parquet, replace, rows, tmp_path, monkey
     path, frame = parquet
     for write, read in ((to_parquet, pl.read_parquet), (to_text, pl.read_csv)):
         table = open_table(path, hashed=False)
-        change = Change(Selection((1, 2, 3)), HALF, ("fx", "fy", "fz"), (1, 2, 3) if replace else ())
+        change = Change(Selection((1, 2, 3)), third, ("fx", "fy", "fz"), (1, 2, 3) if replace else ())
         with (tmp_path / "out").open("wb") as file:
             write(table, change, file)
         table.close()
@@ -219,5 +222,5 @@ def test_a_wrong_value_in_parquet_is_named(tmp_path, monkeypatch):
     )
     table = open_table(tmp_path / "a.parquet", hashed=False)
     with (tmp_path / "out").open("wb") as file, pytest.raises(DataError, match=r'row 35, column "az"'):
-        to_parquet(table, Change(Selection((0, 1, 2)), HALF, ("fx", "fy", "fz")), file)
+        to_parquet(table, Change(Selection((0, 1, 2)), third, ("fx", "fy", "fz")), file)
     table.close()
