@@ -72,7 +72,8 @@ def square_error(e: Float, g: float) -> float:
 
 def length_error(e: Float, g: float) -> Float:
     """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, both of shape (B,)."""
-    return np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
+    error: Float = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
+    return error
 
 
 def examine(
@@ -107,10 +108,11 @@ def examine(
         weighted_sum += float(np.sum(scaled * scaled))
         kept = _worst(scaled) if readings.poses > KEPT else np.arange(len(e))
         parts.append((first + kept, scaled[kept], w[kept], f[kept], e_before[kept]))
-    pose, scaled, w, f, e_before = (np.concatenate(column) for column in zip(*parts, strict=True))
-    kept = np.sort(_worst(scaled)) if readings.poses > KEPT else np.arange(len(pose))
-    chosen = pose[kept], scaled[kept], w[kept], f[kept], e_before[kept]
-    residuals = _judge(*chosen, g, cofactor, weighted_sum, readings.poses - 9)
+    pose, scaled, w, f, before_e = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if readings.poses > KEPT:
+        kept = np.sort(_worst(scaled))
+        pose, scaled, w, f, before_e = (column[kept] for column in (pose, scaled, w, f, before_e))
+    residuals = _judge(pose, scaled, w, f, before_e, g, cofactor, weighted_sum, readings.poses - 9)
     return Fit(
         float(np.sqrt(after_sum / readings.poses)), float(np.sqrt(before_sum / readings.poses)), residuals
     )

@@ -195,10 +195,10 @@ def dilution(result: Calibration) -> str:
             axes.annotate(
                 text, (end if inside else value, row), (4, 0), textcoords="offset points", va="center"
             )
-        limits = ((WEAK, "weak ", DOUBT, "right"), (UNDETERMINED, "undetermined", BAD, "center"))
-        for limit, name, colour, side in limits:
-            axes.axvline(limit, color=colour, linestyle="--", linewidth=1.0)
-            axes.annotate(name, (limit, 1.02), xycoords=("data", "axes fraction"), ha=side, color=colour)
+        for limit, name, colour in ((WEAK, "weak", DOUBT), (UNDETERMINED, "undetermined", BAD)):
+            label = f"{name} above {limit:g}"
+            axes.axvline(limit, color=colour, linestyle="--", linewidth=1.0, label=label)
+        axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
         _log_bars(axes, start, end)
     worst = "infinite" if not known.all() else f"{dop.max():.3g}"
     words = [f"{n} {d:.3g}" if np.isfinite(d) else f"{n} infinite" for n, d in zip(names, dop, strict=True)]

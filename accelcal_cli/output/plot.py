@@ -81,7 +81,9 @@ def _panel(
     costs = np.concatenate([*positive, [tolerance]]) if tolerance > 0 else np.concatenate([*positive])
     floor = float(costs.min()) if costs.size else 1.0
     for label, (evaluations, cost) in panel.items():
-        axes.plot(evaluations, np.maximum(cost, floor / 10), **_style(labels.index(label)))
+        dot = "o" if np.ptp(evaluations) == 0 else ""  # a single evaluation has no line
+        style = _style(labels.index(label))
+        axes.plot(evaluations, np.maximum(cost, floor / 10), marker=dot, markevery=[0], **style)
     if tolerance > 0:
         axes.axhline(tolerance, color="0.6", linewidth=0.8, zorder=0)
         axes.annotate(
@@ -98,4 +100,5 @@ def _panel(
     axes.set_ylabel("median best cost")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.ticklabel_format(axis="x", style="plain")
+    axes.locator_params(axis="x", integer=True)
     axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
