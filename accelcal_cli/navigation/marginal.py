@@ -39,7 +39,9 @@ UNEXPLAINED = 4.0
 """Least mean misfit squared over R at which no track explains a window: by chance once in 60 000 windows of ten."""
 
 SWELL = 4.0
-"""By so much the covariance grows then: the cloud is at a wrong place, or too narrow. Never beyond the initial error."""
+"""By so much the covariance grows then: the cloud is at a wrong place, or too narrow.
+
+It does not grow beyond the initial error."""
 
 TINY = 1e-12
 
