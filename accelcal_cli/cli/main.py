@@ -11,7 +11,7 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import benchmark, calibrate, optimizers, plan, report, simulate, verify
+from accelcal_cli.cli import benchmark, calibrate, capture, optimizers, plan, report, simulate, verify
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -47,6 +47,7 @@ app = typer.Typer(
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
 app.command("verify")(verify.command)
+app.command("capture")(capture.command)
 app.command("plan")(plan.command)
 app.command("report")(report.command)
 app.command("benchmark")(benchmark.command)
