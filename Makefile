@@ -10,17 +10,18 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_NO_DEPS PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION
 unexport PIP_IGNORE_INSTALLED PIP_PYTHON PIP_REPORT PYTHONPATH PYTHONHOME
 
-.PHONY: help demo test lint types bench docs clean
+.PHONY: help demo test lint types bench docs pictures clean
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make demo    install into .venv and calibrate the simulated sample"
-	@echo "make test    run the tests"
-	@echo "make lint    ruff"
-	@echo "make types   mypy"
-	@echo "make bench   run the benchmarks"
-	@echo "make docs    write the tables and outputs in the documentation anew"
-	@echo "make clean   remove what make made"
+	@echo "make demo     install into .venv and calibrate the simulated sample"
+	@echo "make test     run the tests"
+	@echo "make lint     ruff"
+	@echo "make types    mypy"
+	@echo "make bench    run the benchmarks"
+	@echo "make docs     write the tables and outputs in the documentation anew"
+	@echo "make pictures draw the pictures of the optimizers anew"
+	@echo "make clean    remove what make made"
 
 demo: $(VENV)/installed
 	$(BIN)/accelcal calibrate docs/sample.csv --g 9.80665
@@ -40,6 +41,9 @@ bench: $(VENV)/installed-bench
 
 docs: $(VENV)/installed-test
 	$(BIN)/python tests/test_docs.py
+
+pictures: $(VENV)/installed-test
+	$(BIN)/python tests/test_docs.py pictures
 
 $(VENV)/created:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed; name it with make PYTHON=..." >&2; exit 1; }

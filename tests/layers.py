@@ -36,7 +36,10 @@ ONLY_IN = {
 HEAVY = ("scipy", "polars", "boule", "matplotlib", "dask", "jinja2", "serial")
 """Packages that are imported where they are used, never when a module is loaded."""
 
-LATE = {"sensor/parquet.py": "accelcal_cli.sensor.parquet"}
+LATE = {
+    "sensor/parquet.py": "accelcal_cli.sensor.parquet",
+    "sensor/rewrite_parquet.py": "accelcal_cli.sensor.rewrite_parquet",
+}
 """Modules that are nothing without a heavy package: they may load it, and no one may load them early."""
 
 FRONT = ("__init__", "__main__")

@@ -1,6 +1,7 @@
 """The documentation is true: its commands run and print what it says, and nothing is left out of it.
 
-`python tests/test_docs.py` writes the generated tables and the outputs into the pages anew.
+`python tests/test_docs.py` writes the generated tables and the outputs into the pages anew, with pages as arguments
+only into those; `python tests/test_docs.py pictures` draws the pictures of the optimizers anew.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import math
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -36,7 +38,13 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)(?: +(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
-GENERATED = re.compile(r"(<!-- (options|keys): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+GENERATED = re.compile(
+    r"(<!-- (options|keys|parameters|optimizers): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL
+)
+SYMBOL = re.compile(r" \((\w+(?:, or \w+)?)\)|(?<=S-curve): (\w)$")
+"""The symbol of a setting in its description."""
+PICTURE = re.compile(r"^Made by `accelcal (\w+ .*--plot (docs/optimizers/\S+))`\.$", re.MULTILINE)
+EQUATION = re.compile(r"(?:\[(\w+)\] )?eq\. ([\d, and]*\d)")
 HOW = "run `python tests/test_docs.py` and look at what it changed"
 
 
@@ -204,8 +212,14 @@ def option_table(command: str) -> str:
             else ", ".join(f"`{name}`" for name in sorted(names, key=len))
         )
         default = parameter.show_default if isinstance(parameter.show_default, str) else parameter.default
-        if argument or default is None or (isinstance(default, bool) and not parameter.secondary_opts):
-            default = "required" if argument and parameter.required else ""
+        if argument and parameter.required:
+            default = "required"
+        elif isinstance(default, bool):
+            default = (
+                parameter.opts[0].lstrip("-") if default else "".join(parameter.secondary_opts).lstrip("-")
+            )
+        elif default is None:
+            default = ""
         rows.append(f"| {shown} | {default} | {_cell(parameter.help)} |")
     return "\n".join(rows) + "\n"
 
@@ -237,6 +251,37 @@ def key_table(name: str) -> str:
     return "\n".join(rows) + "\n"
 
 
+def parameter_table(name: str) -> str:
+    """Return the settings of an optimizer with symbol, default, range and meaning, one a row."""
+    cls = OPTIMIZERS.get(name)
+    hints = typing.get_type_hints(cls)
+    rows = ["| name | symbol | default | range | meaning |", "| --- | --- | --- | --- | --- |"]
+    for field in dataclasses.fields(cls):
+        meaning = field.metadata["doc"]
+        symbol = SYMBOL.search(meaning)
+        if symbol:
+            meaning = meaning.replace(symbol[0], "", 1)
+        cells = [
+            f"`{field.name}`",
+            (symbol[1] or symbol[2]) if symbol else "",
+            _default(field),
+            _range(hints[field.name], field.metadata),
+            _cell(meaning),
+        ]
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows) + "\n"
+
+
+def optimizer_table(_: str) -> str:
+    """Return the optimizers with family, paper and what they are, one a row."""
+    rows = ["| name | family | paper | what it is |", "| --- | --- | --- | --- |"]
+    for name in OPTIMIZERS.names():
+        cls = OPTIMIZERS.get(name)
+        summary = (cls.__doc__ or "").splitlines()[0]
+        rows.append(f"| [{name}]({name}.md) | {cls.family} | [{cls.paper}] | {_cell(summary)} |")
+    return "\n".join(rows) + "\n"
+
+
 def _default(field: Any) -> str:
     value = field.default
     if value is dataclasses.MISSING or dataclasses.is_dataclass(value):
@@ -263,12 +308,19 @@ def _range(hint: Any, limits: Any) -> str:
     return " ".join(words)
 
 
+TABLES = {
+    "options": option_table,
+    "keys": key_table,
+    "parameters": parameter_table,
+    "optimizers": optimizer_table,
+}
+
+
 def generated(page: Path) -> str:
     """Return a page with its generated tables anew."""
 
     def table(match: re.Match[str]) -> str:
-        rows = option_table(match[3]) if match[2] == "options" else key_table(match[3])
-        return f"{match[1]}{rows}{match[4]}"
+        return f"{match[1]}{TABLES[match[2]](match[3])}{match[4]}"
 
     return GENERATED.sub(table, page.read_text(encoding="utf-8"))
 
@@ -311,6 +363,50 @@ def test_the_schemes_have_the_dilution_that_is_told(tmp_path):
         )
         dop = json.loads("\n".join(reader.run(line)))["dop"]
         assert [f"{dop[kind]:.2f}" for kind in ("misalignment", "scale", "bias")] == told, scheme
+
+
+# The page of each optimizer
+
+
+def optimizer_page(name: str) -> Path:
+    return DOCS / "optimizers" / f"{name}.md"
+
+
+def sources(module: str) -> set[Path]:
+    """Return the file of an optimizer and of those it takes parts from."""
+    folder = ROOT / "accelcal_cli" / "optimizers"
+    text = (folder / f"{module}.py").read_text("utf-8")
+    parts = re.findall(r"^from accelcal_cli\.optimizers\.(\w+) import", text, re.MULTILINE)
+    parts += re.findall(r"^from accelcal_cli\.optimizers import (\w+)$", text, re.MULTILINE)
+    return {folder / f"{module}.py"}.union(*(sources(part) for part in parts))
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS.names())
+def test_every_optimizer_has_a_page_with_the_equations_of_its_source(name):
+    text = optimizer_page(name).read_text("utf-8")
+    cls = OPTIMIZERS.get(name)
+    assert text.startswith(f"# {name}\n")
+    assert f"<!-- parameters: {name} -->" in text
+    assert f"[{cls.paper}]" in text
+    for file in sources(cls.__module__.rpartition(".")[2]):
+        for key, numbers in EQUATION.findall(file.read_text("utf-8")):
+            assert not key or f"[{key}]" in text, f"{file.name}: {key}"
+            for number in re.findall(r"\d+", numbers):
+                assert f"({number})" in text, f"{file.name}: eq. {number}"
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS.names())
+def test_every_optimizer_has_a_picture_and_a_command_that_makes_it(name):
+    text = optimizer_page(name).read_text("utf-8")
+    ((command, picture),) = PICTURE.findall(text)
+    assert re.search(rf"^!\[[^\]]+\]\({re.escape(Path(picture).name)}\)$", text, re.MULTILINE)
+    assert 0 < (ROOT / picture).stat().st_size < 60_000
+    words = shlex.split(command)
+    group = typer.main.get_command(app)
+    with group.commands[words[0]].make_context(words[0], words[1:]) as context:  # type: ignore[attr-defined]
+        assert context.params["plot"] == picture
+        chosen = ",".join(context.params.get("optimizer") or ())
+    assert not chosen or name in chosen.split(",")
 
 
 # Sources, links, the sample
@@ -405,6 +501,24 @@ def _renewed(expected: list[str], printed: list[str]) -> list[str]:
     return lines
 
 
+def draw(page: Path) -> None:
+    """Run the command of a page's picture, with the files that the page shows."""
+    for command, picture in PICTURE.findall(page.read_text(encoding="utf-8")):
+        with tempfile.TemporaryDirectory() as folder:
+            reader = Reader(Path(folder))
+            for _, file, text in blocks(page):
+                if file:
+                    (Path(folder) / file).write_text(text, encoding="utf-8")
+            (Path(folder) / picture).parent.mkdir(exist_ok=True)
+            printed = reader.run(f"accelcal {command} --quiet")
+            assert reader.code == 0, printed
+            (ROOT / picture).write_bytes((Path(folder) / picture).read_bytes())
+
+
 if __name__ == "__main__":
-    for changed in PAGES:
-        refresh(changed)
+    wanted = [Path(name).resolve() for name in sys.argv[1:] if name != "pictures"]
+    for changed in wanted or PAGES:
+        if "pictures" in sys.argv[1:]:
+            draw(changed)
+        else:
+            refresh(changed)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from accelcal_cli.calibration.assemble import assemble
 from accelcal_cli.calibration.compress import compress
 from accelcal_cli.calibration.lotters import Loetters
@@ -12,9 +10,9 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import pose_weights
 from accelcal_cli.calibration.search import reweight, search
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.weighting import shared_weights, weighted
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Float
 
 
 def calibrate(readings: Readings, settings: Settings) -> Calibration:
@@ -30,18 +28,14 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
     """
     if readings.poses < 2 or not (readings.upper > readings.lower).any():
         raise DataError(f"{readings.source}: all readings are equal; expected poses that differ in attitude")
-    weights = pose_weights(readings, settings.weights)
+    shared = settings.weights == "auto"
+    weights = shared_weights(readings, settings) if shared else pose_weights(readings, settings.weights)
     centre = 0.5 * (readings.lower + readings.upper)
     scale = 0.5 * float((readings.upper - readings.lower).max())
-    triangle = compress(_weighted(readings, weights), centre, scale)
+    triangle = compress(weighted(readings, weights), centre, scale)
     start = search_box(triangle, settings)
     problem = Loetters(triangle, settings.g, start.box)
     solution = search(problem, settings)
     if settings.robust != "none":
         solution = reweight(solution, readings, settings, weights)
     return assemble(readings, settings, start, solution, weights)
-
-
-def _weighted(readings: Readings, weights: Float | None) -> Iterator[tuple[Float, Float | None]]:
-    for first, block in readings.blocks():
-        yield block, None if weights is None else weights[first : first + len(block)]

@@ -130,12 +130,29 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
     Args:
         K: K_a in `gauge`; K_lower: the same sensor in gauge `lower`.
         covariance: of the nine parameters, (m/s^2)^2, shape (9, 9).
-        gauge: `lower`, `upper` or `symmetric`; in `full` the off-diagonals are not observable one by one and
-            come out as NaN.
+        gauge: `lower`, `upper` or `symmetric`; in `full` the free rotation moves every entry of K_a, the diagonal to
+            second order, and they come out as NaN.
         g: local gravity, m/s^2.
+    """
+    sigma_D = np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+    if gauge == "full":
+        return np.full((3, 3), np.nan), sigma_D
+    chain = gauge_chain(K, K_lower, gauge, g)
+    lost = np.isnan(np.diagonal(covariance)[:6])
+    variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
+    touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
+    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
+    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
+    # A zero of the gauge has no error.
+    return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
+
+
+def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
+    """Return d K / d parameters, shape (9, 6): the entries of K_a in a gauge by the first six of the nine parameters.
 
     A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
-    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions.
+    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
+    W leaves the body frame unturned.
     """
     R = np.linalg.solve(K, K_lower)
     skew = [_skew(axis) for axis in np.eye(3)]
@@ -145,21 +162,12 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
         E = np.zeros((3, 3))
         E[i, j] = 1.0 / g
         moved = R @ E @ R.T
-        change = -K @ moved
-        if gauge == "full":
-            change = -K @ (0.5 * (moved + moved.T))
-        else:
+        change = -0.5 * K @ (moved + moved.T)
+        if gauge != "full":
             angle = np.linalg.solve(turns, -_conditions(change, gauge))
             change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
         columns.append(change.ravel())
-    chain = np.stack(columns, axis=1)
-    lost = np.isnan(np.diagonal(covariance)[:6])
-    variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
-    touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
-    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
-    if gauge == "full":
-        sigma_K = np.where(np.eye(3) > 0, sigma_K, np.nan)
-    return sigma_K, np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+    return np.stack(columns, axis=1)
 
 
 def _conditions(change: Float, gauge: str) -> Float:

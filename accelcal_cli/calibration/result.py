@@ -11,7 +11,7 @@ import numpy as np
 
 from accelcal_cli.calibration import record as records
 from accelcal_cli.calibration.quality import Verdict
-from accelcal_cli.errors import DataError
+from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.model import GAUGES, ErrorModel
 from accelcal_cli.streams import Float
 
@@ -140,6 +140,18 @@ class Calibration:
     def unit(self) -> str:
         """Unit of the specific force: g when the readings were calibrated against g = 1."""
         return "g" if self.g == 1.0 else "m/s^2"
+
+    def check_determined(self, name: str, *, force: bool = False) -> None:
+        """Refuse to be used where the poses left parameters undetermined, unless forced.
+
+        Raises:
+            UsageError: the verdict is undetermined; `name` is named in the message.
+        """
+        if self.verdict == "undetermined" and not force:
+            why = f" ({self.reasons[0].rstrip('.')})" if self.reasons else ""
+            raise UsageError(
+                f"{name}: its verdict is undetermined{why}; calibrate anew, or use it with --force"
+            )
 
     def record(self) -> dict[str, Any]:
         """Return the record as plain mappings, lists, numbers and text; NaN and inf become None."""

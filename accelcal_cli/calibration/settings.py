@@ -12,7 +12,7 @@ from accelcal_cli.sensor.model import Gauge
 from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
 Robust = Literal["none", "huber", "soft-l1"]
-Weights = Literal["none", "n", "sd"]
+Weights = Literal["none", "n", "sd", "auto"]
 
 LARGEST = 1e30
 """Largest scale factor or bias of a nominal sensor, output units: its fourth power is still a number."""
@@ -62,7 +62,8 @@ class Settings:
     polish: bool = setting(True, "finish by Levenberg-Marquardt")
     robust: Robust = setting("none", "loss: none is least squares")
     weights: Weights = setting(
-        "none", "weight of a pose: none, n (readings averaged) or sd (their scatter and n)"
+        "none",
+        "weight of a pose: none, n (readings averaged), sd (their scatter and n) or auto (sd beside a shared error)",
     )
     box: BoxSettings = field(default_factory=BoxSettings)
     nominal: Nominal | None = setting(None, "stated nominal sensor; estimated when left out")

@@ -36,9 +36,9 @@ def parameters(result: Calibration) -> Table:
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
     if result.gauge == "full":
         notes.append(
-            "In gauge full a rotation of the body frame is free: of the off-diagonals only K_12/K_11 + K_21/K_22, "
-            "K_13/K_11 + K_31/K_33 and K_23/K_22 + K_32/K_33 are observable, and they alone have a sigma "
-            "(next table)."
+            "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
+            "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
+            "gauge lower and the bias."
         )
     return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import detecting, options
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -21,7 +21,10 @@ SUFFIXES = (".yaml", ".yml", ".json")
 
 def command(
     data: Annotated[
-        str, typer.Argument(help="CSV, text or Parquet file of static readings; - is standard input.")
+        str,
+        typer.Argument(
+            help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input."
+        ),
     ],
     columns: options.Columns = None,
     g: options.Gravity = None,
@@ -42,11 +45,26 @@ def command(
         str | None, typer.Option(help="Loss: none, huber or soft-l1.", show_default="none")
     ] = None,
     weights: Annotated[
-        str | None, typer.Option(help="Weight of a pose: none, n or sd.", show_default="none")
+        str | None,
+        typer.Option(help="Weight of a pose: none, n, sd or auto.", show_default="none; auto with --raw"),
     ] = None,
     polish: Annotated[
         bool | None, typer.Option(help="Finish by Levenberg-Marquardt.", show_default="polish")
     ] = None,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="The file is a raw log: find its static poses first, see detect.")
+    ] = False,
+    gyro: detecting.Gyro = None,
+    time: detecting.Time = None,
+    rate: detecting.Rate = None,
+    window: detecting.Window = None,
+    still: detecting.Still = None,
+    multiplier: detecting.Multiplier = None,
+    min_length: detecting.MinLength = None,
+    trim: detecting.Trim = None,
+    merge: detecting.Merge = None,
+    thin: detecting.Thin = None,
+    min_poses: detecting.MinPoses = None,
     tolerance: Annotated[
         float | None, typer.Option(help="Exit 1 when the rms of |f| - g is above this (m/s^2).")
     ] = None,
@@ -62,7 +80,7 @@ def command(
     Exit code 1 means that the verdict is "undetermined" or that --tolerance was missed.
     """
     from accelcal_cli.calibration.pipeline import calibrate
-    from accelcal_cli.config import load_settings
+    from accelcal_cli.config import load_mapping, load_settings
     from accelcal_cli.sensor.readings import read_readings
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
@@ -83,9 +101,29 @@ def command(
     }
     parameters = {"population": population, "iterations": iterations}
     stated = {k: v for k, v in overrides.items() if v is not None}
+    chosen = detecting.stated(
+        gyro=gyro,
+        time=time,
+        rate=rate,
+        window=window,
+        still=still,
+        multiplier=multiplier,
+        min_length=min_length,
+        trim=trim,
+        merge=merge,
+        thin=thin,
+        min_poses=min_poses,
+    )
+    if not raw and chosen:
+        raise UsageError(f"--{next(iter(chosen)).replace('_', '-')}: goes with --raw only")
+    if raw and (config is None or "weights" not in load_mapping(config)):
+        stated.setdefault("weights", "auto")
     stated["parameters"] = {k: v for k, v in parameters.items() if v is not None}
     settings = load_settings(config, stated)
-    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+    if raw:
+        readings = detecting.find_poses(data, columns, chosen, settings.g).readings()
+    else:
+        readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     result = calibrate(readings, settings)
     _show(result, format, output, quiet)
     if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:

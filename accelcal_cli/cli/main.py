@@ -11,7 +11,22 @@ import typer
 import typer.core
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import benchmark, calibrate, capture, optimizers, plan, report, simulate, verify
+from accelcal_cli.cli import (
+    apply,
+    benchmark,
+    calibrate,
+    capture,
+    compare,
+    detect,
+    export,
+    navigate,
+    optimizers,
+    plan,
+    report,
+    reproduce,
+    simulate,
+    verify,
+)
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -46,12 +61,18 @@ app = typer.Typer(
 )
 app.command("calibrate")(calibrate.command)
 app.command("simulate")(simulate.command)
+app.command("detect")(detect.command)
+app.command("apply")(apply.command)
 app.command("verify")(verify.command)
 app.command("capture")(capture.command)
 app.command("plan")(plan.command)
 app.command("report")(report.command)
+app.command("export")(export.command)
 app.command("benchmark")(benchmark.command)
+app.command("compare")(compare.command)
+app.command("reproduce")(reproduce.command)
 app.command("optimizers")(optimizers.command)
+app.command("navigate")(navigate.command)
 
 
 def _version(wanted: bool) -> None:

@@ -32,6 +32,20 @@ def command(
     ] = None,
     samples: Annotated[int, typer.Option(help="Samples of each pose.", min=1)] = 1,
     attitude: Annotated[bool, typer.Option(help="Add the true specific force of each row.")] = False,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Simulate a raw log: poses held, moves between.")
+    ] = False,
+    rate: Annotated[float | None, typer.Option(help="With --raw: rows a second.", show_default="100")] = None,
+    hold: Annotated[
+        float | None, typer.Option(help="With --raw: seconds of each pose.", show_default="5")
+    ] = None,
+    move: Annotated[
+        float | None, typer.Option(help="With --raw: seconds of each move.", show_default="2")
+    ] = None,
+    tremor: Annotated[
+        float | None, typer.Option(help="With --raw: trembling of the hand, m/s^2 rms.", show_default="0")
+    ] = None,
+    gyro: Annotated[bool, typer.Option("--gyro", help="With --raw: add a gyroscope, rad/s.")] = False,
     g: options.Gravity = None,
     latitude: options.Latitude = None,
     height: options.Height = None,
@@ -41,10 +55,14 @@ def command(
 ) -> None:
     """Simulate static readings of an accelerometer with known errors.
 
-    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them.
+    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them. With --raw
+    they are a log of time, acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
     from accelcal_cli.config import dump, load_sensor
     from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.output.log import write_log
+    from accelcal_cli.registry import build
+    from accelcal_cli.sensor.motion import Handling, handled
     from accelcal_cli.sensor.poses import directions
     from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, simulate
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
@@ -56,6 +74,9 @@ def command(
         raise UsageError(f"--positions {positions} with --samples {samples}: at most {MOST_SAMPLES:,} rows")
     if output == truth:
         raise UsageError(f'--truth "{truth}": expected another file than --output')
+    stated = {"rate": rate, "hold": hold, "move": move, "tremor": tremor}
+    handling = {k: v for k, v in stated.items() if v is not None}
+    _check_raw(raw, [*handling, *(["gyro"] * gyro)], samples, attitude)
     for path in (output, truth):
         if path is not None:
             check_target(path)
@@ -63,16 +84,27 @@ def command(
     device = load_sensor(sensor)
     u = directions(positions, scheme, Streams(seed, [0], purpose=ATTITUDE_PURPOSE).normal(positions, 3)[0])
     sigma = device.noise if noise is None else noise
-    readings = simulate(device, u, local_g, samples, sigma, seed)
+    record = _truth(device, local_g, sigma, u)
+    with whole_file(output) as file:
+        if raw:
+            log = handled(device, u, local_g, build(Handling, handling, "simulate --raw"), sigma, seed)
+            record["holds"] = [list(rows) for rows in write_log(log, gyro, file)]
+        else:
+            _write(file, simulate(device, u, local_g, samples, sigma, seed), samples > 1, attitude)
+    sys.stdout.flush()
     if truth is not None:
         with whole_file(truth) as file:
-            file.write(dump(_truth(device, local_g, sigma, u)))
-    with whole_file(output) as file:
-        _write(file, readings, labelled=samples > 1, attitude=attitude)
-    sys.stdout.flush()
+            file.write(dump(record))
 
 
-def _write(file, readings: Simulated, *, labelled: bool, attitude: bool) -> None:  # type: ignore[no-untyped-def]
+def _check_raw(raw: bool, stated: list[str], samples: int, attitude: bool) -> None:
+    if not raw and stated:
+        raise UsageError(f"--{stated[0]}: goes with --raw only")
+    if raw and (samples > 1 or attitude):
+        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'}: does not go with --raw")
+
+
+def _write(file, readings: Simulated, labelled: bool, attitude: bool) -> None:  # type: ignore[no-untyped-def]
     """Write the rows with the shortest digits that read back to the same numbers."""
     names = ["pose"] * labelled + ["Nx", "Ny", "Nz"] + ["fx", "fy", "fz"] * attitude
     file.write(",".join(names) + "\n")

@@ -39,19 +39,23 @@ def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
         OutputError: it cannot be written (folder, permission, full disk); nothing is left behind.
     """
     if path == "-":
-        yield sys.stdout
+        yield sys.stdout.buffer if binary else sys.stdout
         return
     check_target(path)
     target = Path(path)
+    text = {} if binary else {"encoding": "utf-8", "newline": "\n"}
+    device = target.exists() and not target.is_file()  # a pipe or a device, which must not be replaced
     temporary = ""
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        text = {} if binary else {"encoding": "utf-8", "newline": "\n"}
-        with open(handle, "wb" if binary else "w", **text) as file:  # type: ignore[call-overload]
+        if not device:
+            handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+            os.close(handle)
+        with open(temporary or target, "wb" if binary else "w", **text) as file:  # type: ignore[call-overload]
             yield file
-        os.chmod(temporary, _mode(target))
-        os.replace(temporary, target)
-        temporary = ""
+        if not device:
+            os.chmod(temporary, _mode(target))
+            os.replace(temporary, target)
+            temporary = ""
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
     finally:

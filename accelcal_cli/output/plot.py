@@ -19,6 +19,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 """Okabe and Ito's colours, which the colour-blind tell apart; a second round is dashed, a third dotted."""
 
 DASHES = ("-", "--", ":")
+LETTERS, HANDLE = 13, 10
+"""Letters of a legend to an inch, and what line and gap of an entry take of them."""
+
 ACROSS = 3
 """Panels side by side at most."""
 
@@ -41,7 +44,8 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
     down = -(-len(curves) // across)
     labels = list(dict.fromkeys(label for panel in curves.values() for label in panel))
     with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(max(4.2 * across, 6.0), 3.2 * down + 1.1), layout="constrained")
+        width = max(4.2 * across, 6.0)
+        figure = Figure(figsize=(width, 3.2 * down + 1.1), layout="constrained")
         figure.suptitle(title, fontsize=11)
         panels = figure.subplots(down, across, squeeze=False).ravel()
         for axes, (name, panel) in zip(panels, curves.items(), strict=False):
@@ -77,7 +81,9 @@ def _panel(
     costs = np.concatenate([*positive, [tolerance]]) if tolerance > 0 else np.concatenate([*positive])
     floor = float(costs.min()) if costs.size else 1.0
     for label, (evaluations, cost) in panel.items():
-        axes.plot(evaluations, np.maximum(cost, floor / 10), **_style(labels.index(label)))
+        dot = "o" if np.ptp(evaluations) == 0 else ""  # a single evaluation has no line
+        style = _style(labels.index(label))
+        axes.plot(evaluations, np.maximum(cost, floor / 10), marker=dot, markevery=[0], **style)
     if tolerance > 0:
         axes.axhline(tolerance, color="0.6", linewidth=0.8, zorder=0)
         axes.annotate(
@@ -94,4 +100,5 @@ def _panel(
     axes.set_ylabel("median best cost")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.ticklabel_format(axis="x", style="plain")
+    axes.locator_params(axis="x", integer=True)
     axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")

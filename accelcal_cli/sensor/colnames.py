@@ -19,6 +19,19 @@ _SPREAD_GLUED = re.compile(r"(?:std|sd|sigma|s)([xyz])")
 _ACCELERATION = ("acc", "accel", "acceleration", "accelerometer", "linearacceleration")
 _OUTPUT = ("a", *_ACCELERATION, "fieldlinearacceleration", "accsmooth", "n", "out", "output", "")
 _REFERENCE = ("f", "ref", "reference", "fref", "reff", "specificforce")
+_GYRO = (
+    "w",
+    "g",
+    "gyr",
+    "gyro",
+    "gyroscope",
+    "gyrorad",
+    "omega",
+    "angvel",
+    "angularvelocity",
+    "rotationrate",
+)
+_TIME = re.compile(r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?")
 _LABEL = re.compile(r"pose|poses|poseid|poselabel|posename|position|positionid|pos|label|orientation|face")
 _COUNT = frozenset({"n", "count", "counts", "samples", "nsamples", "numsamples", "npoints"})
 _TEMPERATURE = frozenset({"temperature", "temp"})
@@ -80,6 +93,20 @@ def recognise(names: Sequence[str]) -> Roles:
     for group, what in ((spread, "standard deviation"), (reference, "reference")):
         roles.partial += _lacking(group, names, what)
     return roles
+
+
+def gyro_columns(names: Sequence[str]) -> tuple[int, int, int] | None:
+    """Return the columns of a gyroscope, such as wx, wy, wz or gyro_x, gyro_y, gyro_z; None where there are none."""
+    found: dict[tuple[str, int], dict[str, int]] = {}
+    for column, name in enumerate(names):
+        if axis := _axis("".join(tokens_of(name)) or " ", _GYRO):
+            _put(found, axis, column)
+    return next(iter(_triples(found).values()), None)
+
+
+def time_column(names: Sequence[str]) -> int | None:
+    """Return the first column that is called time, None where there is none."""
+    return next((k for k, name in enumerate(names) if _TIME.fullmatch("".join(tokens_of(name)))), None)
 
 
 def _single(roles: Roles, column: int, name: str, key: str) -> bool:

@@ -47,7 +47,7 @@ def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
     roles = recognise(names) if names is not None else Roles()
     note: tuple[str, ...] = ()
     if wanted is not None:
-        output = _stated(table, [wanted] if isinstance(wanted, str) else wanted)
+        output = stated(table, [wanted] if isinstance(wanted, str) else wanted)
     elif names is None:
         output = _nameless(table)
         note = ("no header: columns 1, 2, 3 taken as x, y, z",)
@@ -59,39 +59,38 @@ def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
     return _with_extras(table, output, roles, note)
 
 
-def _stated(table: Table, wanted: Sequence[str]) -> Triple:
+def stated(table: Table, wanted: Sequence[str], option: str = "--columns") -> Triple:
+    """Return the three columns that the user names or numbers; UsageError names the `option`."""
     words = [word.strip() for word in (wanted[0].split(",") if len(wanted) == 1 else wanted)]
     if len(words) != 3:
-        raise UsageError(f"--columns: three columns were expected (x, y, z), not {len(words)}")
-    found = [_column(table, word) for word in words]
+        raise UsageError(f"{option}: three columns were expected (x, y, z), not {len(words)}")
+    found = [find_column(table, word, option) for word in words]
     for k, column in enumerate(found):
         if column in found[:k]:
-            raise UsageError(f'--columns: column "{words[k]}" is asked for twice')
+            raise UsageError(f'{option}: column "{words[k]}" is asked for twice')
     return found[0], found[1], found[2]
 
 
-def _column(table: Table, word: str) -> int:
+def find_column(table: Table, word: str, option: str = "--columns") -> int:
     """Find a column by exact name, by name in any case or without its unit, or by number."""
     names, width = table.names, len(table.numeric)
     for fold in (str, str.lower, _bare_name):
         matches = [k for k, name in enumerate(names or ()) if fold(name) == fold(word)]
         if len(matches) > 1:
             numbers = " or ".join(str(k + 1) for k in matches)
-            raise UsageError(
-                f'--columns: "{word}" could be column {numbers} of {table.name}; give the number'
-            )
+            raise UsageError(f'{option}: "{word}" could be column {numbers} of {table.name}; give the number')
         if matches:
             return matches[0]
     if word.isascii() and word.isdigit():
         if 1 <= int(word) <= width:
             return int(word) - 1
-        raise UsageError(f"--columns: no column {word}; {table.name} has columns 1 to {width}")
+        raise UsageError(f"{option}: no column {word}; {table.name} has columns 1 to {width}")
     if names is None:
         raise UsageError(
-            f'--columns: no column "{word}": {table.name} has no header; give numbers from 1 to {width}'
+            f'{option}: no column "{word}": {table.name} has no header; give numbers from 1 to {width}'
         )
     hint = did_you_mean(word, names) or f"; there are {_listed(names, range(width))}"
-    raise UsageError(f'--columns: no column "{word}" in {table.name}{hint}')
+    raise UsageError(f'{option}: no column "{word}" in {table.name}{hint}')
 
 
 def _nameless(table: Table) -> Triple:

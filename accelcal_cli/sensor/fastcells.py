@@ -41,7 +41,7 @@ class FastParser:
         dialect, selection = self.careful.dialect, self.careful.selection
         if len(set(selection.numbers)) < dialect.width or selection.text is not None:
             return None
-        doubtful = dialect.decimal_comma or not block.endswith(b"\n") or _has_outer_blank_line(block)
+        doubtful = dialect.decimal_comma or not block.endswith(b"\n") or has_outer_blank_line(block)
         return None if doubtful else block
 
     def _plain(self, block: bytes) -> bytes | None:
@@ -60,7 +60,7 @@ class FastParser:
         squeezed = _squeeze(block, dialect.separator)
         if b'"' in block and (dialect.separator == " " or squeezed != block):
             return None  # blanks within quotes belong to the cell
-        return None if b"\r" in squeezed or _has_outer_blank_line(squeezed) else squeezed
+        return None if b"\r" in squeezed or has_outer_blank_line(squeezed) else squeezed
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
@@ -106,7 +106,7 @@ class FastParser:
         return text if all(text) else None
 
 
-def _has_outer_blank_line(block: bytes) -> bool:
+def has_outer_blank_line(block: bytes) -> bool:
     """Whether a block begins or ends with a blank line; polars passes over these without a null."""
     return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
 

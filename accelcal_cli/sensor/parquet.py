@@ -39,7 +39,8 @@ class ParquetTable:
         except BaseException:
             self._files.close()
             raise
-        self._hashing.start(lambda: deque(source.rest(), maxlen=0))
+        if source.hashed:
+            self._hashing.start(lambda: deque(source.rest(), maxlen=0))
         self.names: tuple[str, ...] = tuple(schema)
         self.numeric = tuple(kind.is_numeric() for kind in schema.values())
 
@@ -51,17 +52,26 @@ class ParquetTable:
 
     def blocks(self, selection: Selection) -> Iterator[Rows]:
         """Read the selected columns."""
+        wanted = [self.names[k] for k in (*selection.numbers, *_text_column(selection))]
+        for _, rows in self._read(selection, sorted(set(wanted), key=wanted.index)):
+            yield rows
+
+    def pairs(self, selection: Selection) -> Iterator[tuple[pl.DataFrame, Rows]]:
+        """Read blocks of all columns, each with the selected columns of its rows."""
+        return self._read(selection, list(self.names))
+
+    def _read(self, selection: Selection, wanted: list[str]) -> Iterator[tuple[pl.DataFrame, Rows]]:
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
         start = 0
-        for frame in self._batches(selection):
+        for frame in self._batches(wanted):
             numbers = np.empty((frame.height, len(selection.numbers)))
             for k, column in enumerate(selection.numbers):
-                numbers[:, k] = frame[f"n{k}"].to_numpy()
+                series = frame[self.names[column]].cast(pl.Float64).fill_null(float("nan"))
+                numbers[:, k] = series.to_numpy()
                 self._check(numbers[:, k], start, column, column in selection.gaps)
-            text = None if selection.text is None else self._labels(frame["text"], start, selection.text)
-            yield Rows(start, numbers, text)
+            yield frame, Rows(start, numbers, self._labels(frame, start, selection.text))
             start += frame.height
 
     @property
@@ -90,13 +100,7 @@ class ParquetTable:
             ) from problem
         return Path(copy.name)
 
-    def _batches(self, selection: Selection) -> Iterator[pl.DataFrame]:
-        wanted = [
-            pl.col(self.names[column]).cast(pl.Float64).alias(f"n{k}").fill_null(float("nan"))
-            for k, column in enumerate(selection.numbers)
-        ]
-        if selection.text is not None:
-            wanted.append(pl.col(self.names[selection.text]).cast(pl.String).alias("text"))
+    def _batches(self, wanted: list[str]) -> Iterator[pl.DataFrame]:
         lazy = pl.scan_parquet(self._path).select(wanted)
         start = 0
         while True:
@@ -118,13 +122,19 @@ class ParquetTable:
             where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
             raise DataError(f"{where}: {what}; a finite number was expected")
 
-    def _labels(self, series: pl.Series, start: int, column: int) -> list[str]:
-        labels: list[str | None] = series.to_list()
+    def _labels(self, frame: pl.DataFrame, start: int, column: int | None) -> list[str] | None:
+        if column is None:
+            return None
+        labels: list[str | None] = frame[self.names[column]].cast(pl.String).to_list()
         for row, label in enumerate(labels):
             if not label:
                 where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
                 raise DataError(f"{where}: is empty; every row needs its position label")
         return [label or "" for label in labels]
+
+
+def _text_column(selection: Selection) -> tuple[int, ...]:
+    return () if selection.text is None else (selection.text,)
 
 
 def _row(row: int) -> str:

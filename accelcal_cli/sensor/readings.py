@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -84,6 +84,12 @@ class Readings:
             None if temperature is None else _shaped("temperature", temperature, 1, poses, gaps=True)[:, 0],
         )
         return cls._of(collector, extras, hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest(), None)
+
+    def known_as(
+        self, sha256: str, columns: tuple[str, str, str], notes: Sequence[str], where: Callable[[int], str]
+    ) -> Self:
+        """Return the same poses with the origin of the input that they were taken from."""
+        return replace(self, sha256=sha256, columns=columns, notes=tuple(notes), _line=where)
 
     @classmethod
     def _of(

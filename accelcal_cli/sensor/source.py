@@ -33,16 +33,24 @@ class ByteSource:
     """
 
     def __init__(
-        self, stream: BinaryIO, name: str, *, head: int = HEAD, block: int = BLOCK, owned: bool = False
+        self,
+        stream: BinaryIO,
+        name: str,
+        *,
+        head: int = HEAD,
+        block: int = BLOCK,
+        owned: bool = False,
+        hashed: bool = True,
     ) -> None:
         """Read the first `head` bytes of `stream`; `block` is the size in bytes of every later read.
 
-        An `owned` stream is closed with the source.
+        An `owned` stream is closed with the source; one that is not `hashed` has no `sha256`.
         """
         self.name = name
         self._stream = stream
         self._block = block
         self._owned = owned
+        self.hashed = hashed
         self._stopped = False
         self._hash = hashlib.sha256()
         self._hashing, self._reading = Beside(), Beside()
@@ -103,7 +111,7 @@ class ByteSource:
         raw = self._ahead if self._ahead is not None else self._read(self._block)
         if raw and self._may_read_ahead:
             self._reading.start(self._read_ahead)
-        if raw:
+        if raw and self.hashed:
             self._hashing.start(lambda: self._hash.update(raw))
         return self._unify(raw)
 
@@ -124,10 +132,10 @@ class ByteSource:
         return data
 
 
-def open_source(source: str | Path, stdin: BinaryIO | None = None) -> ByteSource:
+def open_source(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> ByteSource:
     """Open a path, or standard input for ``-``."""
     if str(source) == "-":
-        return ByteSource(stdin or sys.stdin.buffer, "<stdin>")
+        return ByteSource(stdin or sys.stdin.buffer, "<stdin>", hashed=hashed)
     path = Path(source)
     try:
         stream = path.open("rb")
@@ -140,7 +148,7 @@ def open_source(source: str | Path, stdin: BinaryIO | None = None) -> ByteSource
     except (OSError, ValueError) as problem:  # ValueError: a NUL in the name
         raise DataError(f"{source}: cannot be opened ({problem})") from problem
     try:
-        return ByteSource(stream, str(source), owned=True)
+        return ByteSource(stream, str(source), owned=True, hashed=hashed)
     except BaseException:
         stream.close()
         raise

@@ -94,9 +94,9 @@ class Benchmark(Study):
         problem, optimizer = self.problem(name), entry.build()
         stopping = Stopping(self.tolerance if self.stop else None, self.evaluations)
         runs = range(task.first, task.last)
-        start = time.perf_counter()
+        start = time.thread_time()
         run = minimize(problem, optimizer, runs=runs, seed=self.seed, stopping=stopping)
-        return records_of(task, run, self.tolerance, time.perf_counter() - start)
+        return records_of(task, run, self.tolerance, time.thread_time() - start)
 
     def suiting(self, named: Sequence[str]) -> tuple[Benchmark, list[str]]:
         """Return the study without optimizers that suit no function, and a sentence for everything left out.

@@ -14,7 +14,8 @@ import numpy as np
 from accelcal_cli.calibration.lotters import unpack
 from accelcal_cli.sensor.model import to_gauge
 from accelcal_cli.streams import Float
-from accelcal_cli.studies.compare import MATRIX, Comparison
+from accelcal_cli.studies.compare import Comparison
+from accelcal_cli.studies.estimates import MATRIX
 from accelcal_cli.studies.study import Record
 from accelcal_cli.table import Column, Table
 

@@ -47,8 +47,7 @@ class Parts(Study):
         """Return the records of a task's runs."""
         part, own = self._locate(task.cell)
         return [
-            replace(record, cell=task.cell)
-            for record in self.studies[part].execute(replace(task, cell=own))
+            replace(record, cell=task.cell) for record in self.studies[part].execute(replace(task, cell=own))
         ]
 
     def records_of(self, part: int, records: Sequence[Record]) -> list[Record]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from collections.abc import Iterator
@@ -34,30 +35,39 @@ def local_pool(jobs: int) -> Iterator[Executor]:
                 pool.submit(os.getpid)  # starts a worker
         yield pool
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in active_children():
-            if process not in others:
-                process.terminate()
+        with _no_interrupt():  # a second key press waits until the workers have gone
+            for process in active_children():
+                if process not in others:
+                    process.terminate()
+            pool.shutdown(wait=True, cancel_futures=True)
         raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    pool.shutdown()
 
 
 @contextmanager
 def _worker_surroundings() -> Iterator[None]:
-    """Set what processes started meanwhile inherit: one BLAS thread, and no interrupt key while they load."""
+    """Set what processes started meanwhile inherit: one BLAS thread, and no interrupt key."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     resource_tracker.ensure_running()  # its own start would lift the mask
+    try:
+        with _no_interrupt():
+            yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Hold the interrupt key back; processes that are started meanwhile never get it."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
 
 
 def _work() -> None:
@@ -87,16 +97,33 @@ def cluster(address: str) -> Iterator[Executor]:
         raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
     where = f"--cluster {address}"
     connect: Any = distributed.Client
-    try:
-        client = connect(address, timeout=ANSWER_TIME, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{where}: no Dask scheduler answers there ({error})") from None
-    with client:
-        _check_workers(client, where)
+    with _silent("distributed", "distributed.client"):
         try:
-            yield client.get_executor(pure=False)
-        except (KilledWorker, CancelledError, OSError) as error:
-            raise DataError(f"{where}: lost ({type(error).__name__} {error})") from None
+            client = connect(address, timeout=ANSWER_TIME, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise DataError(f"{where}: no Dask scheduler answers there ({error})") from None
+        with client:
+            _check_workers(client, where)
+            try:
+                yield client.get_executor(pure=False)
+            except KilledWorker:
+                raise DataError(f"{where}: a part of the study ends every worker that runs it") from None
+            except (CancelledError, OSError):
+                raise DataError(f"{where}: the scheduler was lost") from None
+
+
+@contextmanager
+def _silent(*names: str) -> Iterator[None]:
+    """Keep loggers from printing what is raised as an error anyway."""
+    loggers = [logging.getLogger(name) for name in names]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _check_workers(client: Any, where: str) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,13 +12,12 @@ from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.registry import build
 from accelcal_cli.streams import Float
-from accelcal_cli.studies import benchmark, compare
+from accelcal_cli.studies import benchmark, compare, outcome
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison
-from accelcal_cli.studies.devices import Printed, parameters, valley
-from accelcal_cli.studies.parts import Parts
-from accelcal_cli.studies.scene import Search, Simulation
-from accelcal_cli.studies.study import Entry, Record
+from accelcal_cli.studies.devices import parameters, valley
+from accelcal_cli.studies.experiment import Experiment, PaperTable, Part
+from accelcal_cli.studies.study import Record
 from accelcal_cli.table import Column, Table
 
 STUDY_KIND = "studies"
@@ -28,97 +27,27 @@ KEYS = ("function", "optimizer")
 CHECKPOINTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Parts of the evaluations at which the convergence table reads the curves."""
 
-Show = Literal["summary", "successful", "curves", "parameters"]
 Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
 
 
-@dataclass(frozen=True)
-class Functions:
-    """Test functions of a part."""
-
-    names: tuple[str, ...]
-    dimensions: int
-    evaluations: int | None = None
-
-
-@dataclass(frozen=True)
-class PaperTable:
-    """What a paper prints: columns by our keys, rows of their values; a value that does not survive is null."""
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
-
-
-@dataclass(frozen=True)
-class Part:
-    """One study of an experiment, either on test functions or on simulated readings.
-
-    Attributes:
-        title: what it repeats.
-        optimizers: label, name and parameters of each.
-        functions: test functions; simulation, search: sensors, poses and search space of a calibration.
-        runs, seed, tolerance, stop: as in `Benchmark` and `Comparison`.
-        show: what is printed of it.
-        paper: the paper's numbers; printed: the paper's estimates by method.
-    """
-
-    title: str
-    optimizers: tuple[Entry, ...]
-    functions: Functions | None = None
-    simulation: Simulation | None = None
-    search: Search | None = None
-    runs: int = 20
-    seed: int = 0
-    tolerance: float = 1e-10
-    stop: bool = False
-    show: tuple[Show, ...] = ("summary",)
-    paper: PaperTable | None = None
-    printed: tuple[Printed, ...] = ()
-
-    def study(self) -> Benchmark | Comparison:
-        """Return the study.
-
-        Raises:
-            ConfigError: neither functions nor simulation and search.
-        """
-        common = {"repeats": self.runs, "seed": self.seed, "tolerance": self.tolerance, "stop": self.stop}
-        if self.functions:
-            f = self.functions
-            return Benchmark(f.names, self.optimizers, f.dimensions, evaluations=f.evaluations, **common)
-        if self.simulation and self.search:
-            return Comparison(self.simulation, self.search, self.optimizers, **common)
-        raise ConfigError(f"{self.title}: expected functions, or simulation and search")
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """An experiment of a paper.
-
-    Attributes:
-        title, source: what it is and where it stands; note: what to know when reading it.
-        parts: its studies.
-    """
-
-    title: str
-    source: str
-    parts: tuple[Part, ...]
-    note: str = ""
-    name: str = field(default="", kw_only=True)
-
-    def study(self) -> Parts:
-        """Return all parts as one study."""
-        return Parts(tuple(part.title for part in self.parts), tuple(part.study() for part in self.parts))
-
-
 def names() -> list[str]:
-    """Return the experiments by name."""
-    return list(shipped(STUDY_KIND))
+    """Return the experiments on optimizers by name."""
+    return [name for name in shipped(STUDY_KIND) if name not in voyages()]
+
+
+def voyages() -> list[str]:
+    """Return the experiments on navigation filters by name; studies.navigation runs them."""
+    return [name for name, path in shipped(STUDY_KIND).items() if "filters" in load_mapping(path)]
 
 
 def catalogue() -> Table:
     """Return the experiments and what they repeat."""
-    rows = tuple((name, (found := load(name)).title, found.source) for name in names())
-    return Table("Experiments", (Column("name"), Column("title"), Column("source")), rows)
+    rows = [(name, (found := load(name)).title, found.source) for name in names()]
+    files = shipped(STUDY_KIND)
+    for name in voyages():
+        content = load_mapping(files[name])
+        rows.append((name, content["title"], content["source"]))
+    return Table("Experiments", (Column("name"), Column("title"), Column("source")), tuple(sorted(rows)))
 
 
 def load(name: str) -> Experiment:
@@ -165,7 +94,7 @@ def _tables(part: Part, records: Sequence[Record]) -> list[Table]:
         if show == "summary":
             found.append(beside(_summary(study, records), part.paper))
         elif show == "successful" and isinstance(study, Comparison):
-            own = compare.summary(study, records, only_successful=True)
+            own = outcome.summary(study, records, only_successful=True)
             found.append(replace(own, title="successful runs alone", notes=()))
         elif show == "curves":
             found.append(checkpoints(curves_of(study, records)))
@@ -175,7 +104,9 @@ def _tables(part: Part, records: Sequence[Record]) -> list[Table]:
 
 
 def _summary(study: Benchmark | Comparison, records: Sequence[Record]) -> Table:
-    module = benchmark.summary(study, records) if isinstance(study, Benchmark) else compare.summary(study, records)
+    module = (
+        benchmark.summary(study, records) if isinstance(study, Benchmark) else outcome.summary(study, records)
+    )
     return replace(module, title="")
 
 
@@ -201,11 +132,18 @@ def beside(ours: Table, paper: PaperTable | None) -> Table:
     return replace(ours, columns=columns, rows=tuple(rows))
 
 
-def curves(experiment: Experiment, records: Sequence[Record]) -> Curves:
-    """Return the median convergence by part (or function) and optimizer."""
+def curves(experiment: Experiment, records: Sequence[Record], shown: bool = False) -> Curves:
+    """Return the median convergence by function, or part, and optimizer.
+
+    Args:
+        experiment: the experiment; records: of its runs.
+        shown: only of the parts that show their curves.
+    """
     study = experiment.study()
     found: dict[str, Mapping[str, tuple[Float, Float]]] = {}
     for number, part in enumerate(experiment.parts):
+        if shown and "curves" not in part.show:
+            continue
         own = study.records_of(number, records)
         for name, panel in curves_of(part.study(), own).items():
             found[name if name else part.title] = panel
@@ -230,6 +168,4 @@ def checkpoints(curves: Curves) -> Table:
         values = [float(cost[i]) if i >= 0 else None for i in index]
         rows.append((*([name] if name else []), label, *values))
     keys = (Column("function"),) if any(name for name, _, _ in panels) else ()
-    return Table(
-        "median cost after so many evaluations", (*keys, Column("optimizer"), *columns), tuple(rows)
-    )
+    return Table("median cost after so many evaluations", (*keys, Column("optimizer"), *columns), tuple(rows))

@@ -7,7 +7,7 @@ and its box from its own streams, so that it is the same in any company.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from accelcal_cli.sensor.poses import directions
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, NOISE_PURPOSE, Sensor, draw
 from accelcal_cli.streams import Float, Streams
+
+START_PURPOSE = 6
+"""Stream of starting points outside the box."""
 
 FEWEST = 9
 """Poses that nine parameters need."""
@@ -48,7 +51,9 @@ class Simulation:
     def __post_init__(self) -> None:
         """Refuse poses that cannot determine nine parameters, and noise that is none."""
         if self.positions < FEWEST:
-            raise ConfigError(f"positions: {self.positions} is too few; nine parameters need at least {FEWEST}")
+            raise ConfigError(
+                f"positions: {self.positions} is too few; nine parameters need at least {FEWEST}"
+            )
         if not (np.isfinite(self.noise) and self.noise >= 0):
             raise ConfigError(f"noise: {self.noise:g}: expected zero or more, in m/s^2")
 
@@ -69,14 +74,12 @@ class Recording:
         """Return readings as part of a study.
 
         Raises:
-            DataError: fewer than nine poses, or all readings are equal.
+            DataError: fewer than nine poses.
         """
         if readings.poses < FEWEST:
             raise DataError(
                 f"{readings.source}: {readings.poses} poses; nine parameters need at least {FEWEST}, better 12 or more"
             )
-        if not (readings.upper > readings.lower).any():
-            raise DataError(f"{readings.source}: all readings are equal; expected poses that differ in attitude")
         centre = 0.5 * (readings.lower + readings.upper)
         scale = 0.5 * float((readings.upper - readings.lower).max())
         packed = compress(((block, None) for _, block in readings.blocks()), centre, scale)
@@ -104,7 +107,7 @@ class Search:
 
     g: float
     unknowns: int = 9
-    box: BoxSettings = BoxSettings()
+    box: BoxSettings = field(default_factory=BoxSettings)
     nominal: float | None = None
     start: BoxSettings | None = None
 
@@ -156,7 +159,9 @@ def recorded(source: Recording, space: Search, runs: Sequence[int], seed: int) -
     return Scene(problem, truth, found.cost, _information(triangle, space.g, truth))
 
 
-def starting_points(scene: Scene, space: Search, population: int, runs: Sequence[int], seed: int) -> Float | None:
+def starting_points(
+    scene: Scene, space: Search, population: int, runs: Sequence[int], seed: int
+) -> Float | None:
     """Return starting points in box coordinates, shape (R, P, D), or None for the box itself."""
     if space.start is None:
         return None
@@ -166,10 +171,6 @@ def starting_points(scene: Scene, space: Search, population: int, runs: Sequence
     half = half_widths(scale, space.start, space.g, space.unknowns)
     u = 2.0 * Streams(seed, runs, purpose=START_PURPOSE).uniform(population, space.unknowns) - 1.0
     return (centre[:, None] + half[:, None] * u - box.centre[:, None]) / box.half[:, None]
-
-
-START_PURPOSE = 6
-"""Stream of starting points outside the box."""
 
 
 def _information(triangle: Triangle, g: float, truth: ErrorModel) -> Float:

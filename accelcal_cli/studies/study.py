@@ -69,7 +69,7 @@ class Record:
         hit: evaluations when the cost first was at or below the tolerance, or None.
         values: further results of the kind of study (parameter errors, ...), by name.
         curve: pairs (evaluations, best cost so far), thinned; none beyond the first CURVES runs.
-        seconds: wall time of the run: its share of its block's.
+        seconds: time of the run: its share of its block's.
     """
 
     cell: int
@@ -143,7 +143,7 @@ def records_of(
         task: whose runs they are.
         run: what `minimize` returned, with its trace.
         tolerance: cost that counts as a hit, for all runs or shape (R,); None has no hits.
-        seconds: wall time of the block.
+        seconds: time of the block.
         values: further results of each run.
     """
     limits = np.broadcast_to(np.nan if tolerance is None else tolerance, len(run.runs))

@@ -1,0 +1,139 @@
+"""A result applied to a log: calibrated specific force beside the readings, or in their place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import IO
+
+import numpy as np
+
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.tilt import Tilt
+from accelcal_cli.errors import DataError, UsageError, did_you_mean
+from accelcal_cli.sensor.cells import Selection
+from accelcal_cli.sensor.columns import Columns, choose
+from accelcal_cli.sensor.poses import AXES
+from accelcal_cli.sensor.rewrite import Change, rewrite
+from accelcal_cli.sensor.tabular import Table, TextTable
+from accelcal_cli.sensor.units import STANDARD_GRAVITY
+from accelcal_cli.streams import Float
+
+UNITS = {"m/s^2": 1.0, "g": 1.0 / STANDARD_GRAVITY, "mg": 1000.0 / STANDARD_GRAVITY}
+"""Units of the specific force, and how many of each are 1 m/s^2."""
+
+TILT = ("roll", "pitch", "sigma_roll", "sigma_pitch")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What to write.
+
+    Attributes:
+        unit: of the specific force: m/s^2, g or mg; that of the result when None.
+        replace: in place of the readings; else in columns after all others.
+        prefix: name of the new columns before x, y, z.
+        tilt: also roll, pitch and their one-sigma in degrees.
+        noise: one-sigma of a reading, m/s^2 (units of g when g = 1), for the sigma of the tilt.
+    """
+
+    unit: str | None = None
+    replace: bool = False
+    prefix: str = "f"
+    tilt: bool = False
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown unit, a noise that is none, and a prefix that would break the header."""
+        if self.unit is not None and self.unit not in UNITS:
+            raise UsageError(
+                f'--unit "{self.unit}": unknown{did_you_mean(self.unit, UNITS)}; expected one of {", ".join(UNITS)}'
+            )
+        if not (math.isfinite(self.noise) and self.noise >= 0):
+            raise UsageError(f"--noise {self.noise:g}: expected zero or more")
+        if not self.prefix.replace("_", "a").isalnum():
+            raise UsageError(f'--prefix "{self.prefix}": expected letters, digits and underscores')
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the new columns."""
+        return (*(self.prefix + axis for axis in AXES), *(TILT if self.tilt else ()))
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log and what is to become of it.
+
+    Attributes:
+        table: the log, open and not read yet.
+        change: the new columns.
+        notes: what a user should know.
+    """
+
+    table: Table
+    change: Change
+    notes: tuple[str, ...]
+
+    @property
+    def parquet(self) -> bool:
+        """Whether the log is Parquet, and can be written as such."""
+        return not isinstance(self.table, TextTable)
+
+    def write(self, file: IO[bytes], *, parquet: bool = False) -> None:
+        """Write the changed log, in constant memory.
+
+        Args:
+            file: where to; with `parquet` a file that has a name.
+            parquet: as Parquet instead of text, which a Parquet log alone can be.
+
+        Raises:
+            DataError: a reading that is wrong, by its line and column.
+        """
+        if isinstance(self.table, TextTable):
+            rewrite(self.table, self.change, file)
+            return
+        from accelcal_cli.sensor.rewrite_parquet import to_parquet, to_text
+
+        (to_parquet if parquet else to_text)(self.table, self.change, file)
+
+
+def prepare(result: Calibration, table: Table, wanted: list[str] | None, wish: Wish) -> Log:
+    """Return a log together with what the result makes of it.
+
+    Args:
+        result: the calibration; its verdict is the caller's concern.
+        table: the log; `wanted` names its three output columns, or None.
+        wish: what to write.
+
+    Raises:
+        DataError, UsageError: no such columns, or a new one has the name of one that is there.
+    """
+    columns = choose(table, wanted)
+    names = list(table.names or ())
+    kept = [n for k, n in enumerate(names) if not (wish.replace and k in columns.output)]
+    taken = [name for name in wish.names if name in kept]
+    if taken:
+        raise DataError(f'{table.name}: has a column "{taken[0]}" already; choose another --prefix')
+    change = Change(
+        Selection(columns.output), _formula(result, wish), wish.names, columns.output if wish.replace else ()
+    )
+    return Log(table, change, _notes(columns))
+
+
+def _notes(columns: Columns) -> tuple[str, ...]:
+    return tuple(note for note in columns.notes if "taken as x, y, z" in note)
+
+
+def _formula(result: Calibration, wish: Wish) -> Callable[[Float], Float]:
+    """Return the function from output, shape (B, 3), to the new columns, shape (B, k)."""
+    own = "g" if result.unit == "g" else "m/s^2"
+    factor = UNITS[wish.unit or own] / UNITS[own]
+    model, tilt = result.model, Tilt.of(result, wish.noise) if wish.tilt else None
+
+    def compute(numbers: Float) -> Float:
+        force = model.specific_force(numbers[:, :3])
+        scaled = force if factor == 1.0 else force * factor
+        return scaled if tilt is None else np.concatenate([scaled, tilt.columns(force)], axis=1)
+
+    return compute

@@ -1,0 +1,70 @@
+"""What to say when a raw log has too few still poses: what was seen, and what would change it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.intervals import Found
+from accelcal_cli.sensor.spans import Rows
+from accelcal_cli.sensor.static import Level
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.detection import Candidate
+
+MOVING = 0.05
+"""A quietest window that scatters by more than this part of the range of the readings is not still."""
+
+
+def too_few(
+    name: str, found: Sequence[Found], candidates: Sequence[Candidate], level: Level, rows: Rows, least: int
+) -> DataError:
+    """Return the error of a log in which no multiplier finds `least` attitudes."""
+    best = max(range(len(found)), key=lambda k: (candidates[k].attitudes, candidates[k].poses))
+    seen, count = found[best], candidates[best]
+    threshold = seen.multiplier * level.variance
+    poses, alike = _counted(count.poses, "still pose"), _counted(count.attitudes, "attitude")
+    parts = [
+        f"{name}: {poses} in {alike}, fewer than {least}",
+        f"quietest variance {level.quietest:.4g}, threshold {threshold:.4g} (multiplier {seen.multiplier:g})",
+        _lengths(seen, rows),
+        _advice(seen, count, level, rows, [f.multiplier for f in found], least),
+    ]
+    return DataError("; ".join(parts))
+
+
+def _counted(number: int, what: str) -> str:
+    plural = "" if number == 1 else "es" if what.endswith("ch") else "s"
+    return f"{number:,} {what}{plural}"
+
+
+def _lengths(seen: Found, rows: Rows) -> str:
+    whole = [n + 2 * rows.trim for n in seen.intervals.n.tolist()] + seen.short.tolist()
+    if not whole:
+        return "no window is below it"
+    text = f"longest still stretch {max(whole):,} rows, of which {rows.trim:,} are trimmed off each end"
+    if not len(seen.short):
+        return text
+    low, high = int(seen.short.min()), int(seen.short.max())
+    span = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+    number = _counted(len(seen.short), "stretch")
+    return f"{text}; {number} of {span} rows too short for a least length of {rows.least:,}"
+
+
+def _advice(
+    seen: Found, count: Candidate, level: Level, rows: Rows, multipliers: Sequence[float], least: int
+) -> str:
+    """Name the setting, or the handling, that most likely helps."""
+    if count.poses >= least:
+        return "turn the sensor to more attitudes, or accept fewer with --min-poses"
+    if math.sqrt(level.quietest) > MOVING * level.extent:
+        scatter = f"{math.sqrt(level.quietest):.3g} where the readings change by {level.extent:.3g}"
+        return f"no part of the log is still: even its quietest window scatters by {scatter}"
+    if count.poses + np.count_nonzero(seen.short > 1.5 * rows.window) >= least:
+        return "hold each pose longer, or lower --min-length or --trim"
+    beyond = f"--multiplier above {max(multipliers):g}, a shorter --window or a lower --min-length"
+    return f"record more poses held still; if the log has more, try {beyond}"

@@ -1,0 +1,76 @@
+"""`accelcal apply`: a raw log in, calibrated specific force out."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from accelcal_cli.cli import options
+from accelcal_cli.errors import UsageError
+
+PARQUET = (".parquet", ".pq")
+
+
+def command(
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    data: Annotated[str, typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.")],
+    output: Annotated[
+        str, typer.Option("--output", "-o", help="Log to write, .parquet for Parquet; - is standard output.")
+    ] = "-",
+    columns: options.Columns = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(help="Unit of the specific force: m/s^2, g or mg.", show_default="the result's"),
+    ] = None,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace", help="Write the force in place of the readings, not after the last column."
+        ),
+    ] = False,
+    prefix: Annotated[str, typer.Option(help="Name of the new columns, before x, y and z.")] = "f",
+    tilt: Annotated[
+        bool,
+        typer.Option("--tilt", help="Add roll, pitch and their sigma, in degrees: for a sensor at rest."),
+    ] = False,
+    noise: Annotated[
+        float, typer.Option(help="Noise of one row and axis, one sigma, m/s^2, for the sigma of --tilt.")
+    ] = 0.0,
+    force: Annotated[
+        bool, typer.Option("--force", help="Use a result although its verdict is undetermined.")
+    ] = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Apply a calibration to a log of any length.
+
+    Adds the calibrated specific force as columns fx, fy, fz. All other columns stay as they are, byte for byte in
+    text. The log streams through: memory does not grow with it.
+    """
+    from accelcal_cli.calibration.apply import Wish, prepare
+    from accelcal_cli.config import load_result
+    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.sensor.tabular import open_table
+
+    options.check_input(data)
+    check_target(output)
+    wish = Wish(unit, replace, prefix, tilt, noise)
+    calibration = load_result(result)
+    calibration.check_determined(result, force=force)
+    table = open_table(data, sys.stdin.buffer, hashed=False)
+    try:
+        log = prepare(calibration, table, options.split_columns(columns), wish)
+        parquet = Path(output).suffix.lower() in PARQUET
+        if parquet and not log.parquet:
+            raise UsageError(f'-o "{output}": {data} is text and is written as text; expected another ending')
+        with whole_file(output, binary=True) as file:
+            log.write(file, parquet=parquet)
+    finally:
+        table.close()
+    sys.stdout.flush()
+    if not quiet:
+        notes = (*log.notes, *([] if output == "-" else [f"wrote {output}"]))
+        for note in notes:
+            typer.echo(f"accelcal: {note}", err=True)

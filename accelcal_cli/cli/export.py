@@ -1,0 +1,60 @@
+"""`accelcal export`: a result in the formats that other tools read."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Annotated
+
+import typer
+
+from accelcal_cli.cli import options
+from accelcal_cli.errors import UsageError
+
+NAMES = "px4, ardupilot, kalibr, imucal, ros, c-header or numpy"
+
+
+def command(
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    to: Annotated[str, typer.Option(help=f"Format: {NAMES}.", metavar="FORMAT")],
+    output: Annotated[str, typer.Option("--output", "-o", help="File to write; - is standard output.")] = "-",
+    instance: Annotated[int, typer.Option(help="Number of the accelerometer in the target.", min=0)] = 0,
+    driver_scale: Annotated[
+        float | None,
+        typer.Option(
+            help="Output units that the target's driver takes for 1 m/s^2 (px4, ardupilot, kalibr)."
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Use a result although its verdict is undetermined.")
+    ] = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write a result in the format of another tool.
+
+    Warns of what the format cannot hold. PX4 and ArduPilot have no misalignments.
+    """
+    from accelcal_cli.calibration.exporters.base import Target
+    from accelcal_cli.calibration.exporters.formats import check_name, export
+    from accelcal_cli.config import load_result
+    from accelcal_cli.output.files import check_target, whole_file
+
+    check_name(to)
+    if driver_scale is not None and not (math.isfinite(driver_scale) and driver_scale > 0):
+        raise UsageError(f"--driver-scale {driver_scale:g}: expected a positive number")
+    check_target(output)
+    if to == "numpy" and output == "-" and sys.stdout.isatty():
+        raise UsageError("--to numpy is no text for a terminal; name a file with -o")
+    calibration = load_result(result)
+    calibration.check_determined(result, force=force)
+    made = export(calibration, to, Target(instance, driver_scale))
+    with whole_file(output, binary=True) as file:
+        file.write(made.content)
+    sys.stdout.flush()
+    if not quiet:
+        notes = (
+            *(f"warning: {text}" for text in made.warnings),
+            *([] if output == "-" else [f"wrote {output}"]),
+        )
+        for note in notes:
+            typer.echo(f"accelcal: {note}", err=True)

@@ -1,0 +1,203 @@
+"""The sampling-importance-resampling particle filter [gordon1993], and where evolution enters it [depf2015] section 6.
+
+The state is the position error alone, a random walk (`state: 2`), or all twelve errors (`state: 12`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from accelcal_cli.navigation.error_model import STATES, process_noise
+from accelcal_cli.navigation.filters import Filter, Track, log_likelihood
+from accelcal_cli.navigation.resampling import SCHEMES, effective_size, moments, normalised
+from accelcal_cli.navigation.scenario import Scenario
+from accelcal_cli.registry import check, setting
+from accelcal_cli.streams import Bool, Float, Streams
+
+Fitness = Callable[[Float], Float]
+CHUNK = 60
+"""Epochs whose transition matrices are made together."""
+
+GATE = 3.0
+"""Evolved particles stay within so many sigma of the predicted cloud [chosen]."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Particles of R runs: x, metric states (R, N, D), and the logarithms of their weights, (R, N)."""
+
+    x: Float
+    log_weights: Float
+
+
+@dataclass(frozen=True)
+class Sir(Filter):
+    """The plain particle filter; [depf2015] section 6 without step 3."""
+
+    mode: Literal["default", "literal"] = setting("default", "`literal`: R as stated; `default`: widened")
+    particles: int = setting(100, "N, particles", low=4, high=1_000_000)
+    roughening: float = setting(
+        30.0, "noise of the position error in a step of 10 s, m", low=0.0, high=10_000.0
+    )
+    variance: float | None = setting(
+        None, "R in the filter, mGal^2; not set: 1 in mode literal, 4 in mode default", above=0.0
+    )
+    threshold: float = setting(2 / 3, "resample when N_eff is below this part of N", low=0.0, high=1.0)
+    resampling: Literal["systematic", "residual"] = setting("systematic", "scheme")
+    state: Literal[2, 12] = setting(2, "position error alone, or all twelve errors")
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
+
+    def run(self, scenario: Scenario, streams: Streams) -> Track:
+        """Return the track: propagate, weigh, evolve, estimate, resample; [depf2015] steps 1 to 5."""
+        track = Track.empty(scenario)
+        cloud = self._start(scenario, streams)
+        F: Float = np.empty(0)
+        lookups = 0
+        for k in range(scenario.epochs):
+            if k and self.state == STATES and (k - 1) % CHUNK == 0:
+                F = scenario.transitions(k - 1, min(k - 1 + CHUNK, scenario.epochs))
+            if k:
+                step = F[:, (k - 1) % CHUNK] if self.state == STATES else None
+                cloud = replace(cloud, x=self._propagated(scenario, cloud.x, step, streams))
+            cloud, weights, used, seen = self.update(scenario, cloud, k, streams)
+            lookups += used
+            track.mean[:, k], track.covariance[:, k] = moments(weights, cloud.x[..., :2])
+            track.blind[:] += ~seen
+            cloud = self._resampled(cloud, weights, streams)
+        return replace(track, lookups=lookups / scenario.epochs)
+
+    def update(
+        self,
+        scenario: Scenario,
+        cloud: Cloud,
+        k: int,
+        streams: Streams,  # noqa: ARG002  # an evolution draws from them
+    ) -> tuple[Cloud, Float, int, Bool]:
+        """Return the cloud with its new weights, these as numbers, the look-ups, and which runs see the map."""
+        likelihood = self.likelihood(scenario, k, cloud.x)
+        cloud = replace(cloud, log_weights=cloud.log_weights + likelihood)
+        seen: Bool = likelihood.max(axis=1) > -1e5
+        return cloud, normalised(cloud.log_weights), self.particles, seen
+
+    def likelihood(self, scenario: Scenario, k: int, x: Float) -> Float:
+        """Return the log-likelihood of particles x, shape (R, n, D), at epoch k."""
+        anomaly = scenario.anomaly(k, x[..., 0], x[..., 1])
+        return log_likelihood(scenario.measured[:, k, None], anomaly, self.believed_variance(scenario))
+
+    def believed_variance(self, scenario: Scenario) -> float:
+        """Return R in mGal^2: stated, or the gravimeter's, four times as much in the default mode."""
+        if self.variance is not None:
+            return self.variance
+        return scenario.noise**2 * (1.0 if self.mode == "literal" else 4.0)
+
+    def _start(self, scenario: Scenario, streams: Streams) -> Cloud:
+        """Return the particles of step 1: position uniform in the initial square."""
+        x = streams.normal(self.particles, self.state) * np.sqrt(scenario.prior()[: self.state])
+        x[..., :2] = scenario.initial * (2.0 * streams.uniform(self.particles, 2) - 1.0)
+        return Cloud(x, np.zeros(x.shape[:2]))
+
+    def _propagated(self, scenario: Scenario, x: Float, F: Float | None, streams: Streams) -> Float:
+        rough = self.roughening * np.sqrt(scenario.period / 10.0)
+        if F is None:
+            walked: Float = x + rough * streams.normal(self.particles, 2)
+            return walked
+        noise = streams.normal(self.particles, STATES)
+        noise *= np.sqrt(process_noise(scenario.grade, scenario.period, rough))
+        moved: Float = (F @ x.swapaxes(1, 2)).swapaxes(1, 2) + noise
+        return moved
+
+    def _resampled(self, cloud: Cloud, weights: Float, streams: Streams) -> Cloud:
+        """Return the cloud with equal weights in the runs whose effective size is too small."""
+        low = effective_size(weights) < self.threshold * self.particles
+        chosen = SCHEMES[self.resampling](weights, streams.uniform(1, 1)[:, 0, 0])
+        chosen = np.where(low[:, None], chosen, np.arange(self.particles))
+        logs = np.where(low[:, None], 0.0, cloud.log_weights - cloud.log_weights.max(axis=1, keepdims=True))
+        x = np.take_along_axis(cloud.x.swapaxes(1, 2), chosen[:, None], axis=2).swapaxes(1, 2)
+        return Cloud(x, logs)
+
+
+@dataclass(frozen=True)
+class Evolving(Sir):
+    """A particle filter whose predicted particles an evolution moves before they are weighed.
+
+    In mode `literal` all particles move at every epoch, by the likelihood alone, as the paper has it. In mode
+    `default` only the worst fifth moves, only when the weights degenerate, and the fitness is the posterior: likelihood
+    times the Gaussian of the predicted cloud, within three sigma.
+    """
+
+    generations: int = setting(20, "of the evolution at an epoch", low=0, high=1000)
+    fraction: float = setting(0.2, "part of the particles that moves in mode default", above=0.0, high=1.0)
+
+    @abstractmethod
+    def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
+        """Return particles whose first `movers` have moved.
+
+        Args:
+            x: positions, shape (R, N, 2), worst first in mode default.
+            fitness: shape (R, N).
+            movers: n, how many may move; rate: fitness of positions, shape (R, n, 2).
+        """
+
+    def update(
+        self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
+    ) -> tuple[Cloud, Float, int, Bool]:
+        """Return the cloud evolved and weighed; see `Sir.update`."""
+        prior = normalised(cloud.log_weights)
+        old = cloud
+        cloud, weights, used, seen = super().update(scenario, cloud, k, streams)
+        low = effective_size(weights) < self.threshold * self.particles
+        if not self.generations or not (self.mode == "literal" or low.any()):
+            return cloud, weights, used, seen
+        if self.mode == "literal":
+            moved = self._literal(scenario, old, k, streams)
+            movers = self.particles
+        else:
+            moved, movers = self._safe(scenario, cloud, prior, k, streams)
+            x = np.where(low[:, None, None], moved.x, cloud.x)
+            moved = Cloud(x, np.where(low[:, None], moved.log_weights, cloud.log_weights))
+        return moved, normalised(moved.log_weights), used + movers * self.generations, seen
+
+    def _literal(self, scenario: Scenario, old: Cloud, k: int, streams: Streams) -> Cloud:
+        def rate(position: Float) -> Float:
+            return self.likelihood(scenario, k, position)
+
+        x = old.x.copy()
+        x[..., :2] = self.evolve(x[..., :2], rate(x), self.particles, rate, streams)
+        return Cloud(x, old.log_weights + rate(x))
+
+    def _safe(
+        self, scenario: Scenario, cloud: Cloud, prior: Float, k: int, streams: Streams
+    ) -> tuple[Cloud, int]:
+        """Evolve the worst particles toward the posterior; their old weight becomes the mean one."""
+        mean, covariance = moments(prior, cloud.x[..., :2])
+        scale = np.sqrt(np.einsum("rii->ri", covariance)) + 1e-9
+        inverse = np.linalg.inv(covariance + 1e-6 * np.eye(2))
+
+        def rate(position: Float) -> Float:
+            away = position - mean[:, None]
+            distance = ((away @ inverse) * away).sum(axis=2)
+            inside = (np.abs(away) <= GATE * scale[:, None]).all(axis=2)
+            return np.where(inside, self.fitness(scenario, k, position) - 0.5 * distance, -np.inf)
+
+        order = np.argsort(cloud.log_weights, axis=1, kind="stable")
+        x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
+        logs = np.take_along_axis(cloud.log_weights, order, axis=1)
+        movers = max(1, round(self.fraction * self.particles))
+        x[..., :2] = self.evolve(x[..., :2], rate(x[..., :2]), movers, rate, streams)
+        logs[:, :movers] = self.likelihood(scenario, k, x[:, :movers]) + np.log(
+            np.take_along_axis(prior, order, axis=1)[:, :movers].mean(axis=1, keepdims=True) * self.particles
+            + 1e-300
+        )
+        return Cloud(x, logs), movers
+
+    def fitness(self, scenario: Scenario, k: int, position: Float) -> Float:
+        """Return the likelihood part of the fitness; shape (R, n)."""
+        return self.likelihood(scenario, k, position)

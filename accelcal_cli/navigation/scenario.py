@@ -1,0 +1,145 @@
+"""What a filter is given: indicated track, measured gravity, map and INS grade, for R runs at K epochs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.navigation.earth import metres_per_radian
+from accelcal_cli.navigation.error_model import STATES, Grade, discretise, dynamics, metric
+from accelcal_cli.navigation.gravity_map import GravityMap
+from accelcal_cli.navigation.voyage import INS_PURPOSE, SECONDS_PER_HOUR, Plan, Route, ins_errors, planned
+from accelcal_cli.streams import Float, Streams
+
+GRAVITY_PURPOSE = 22
+VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA = 0.6, 1e-4, 1e-3
+"""Of the prior, chosen: m/s, rad, rad."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """R runs of K epochs.
+
+    Attributes:
+        gravity_map: the map.
+        grade: of the INS.
+        noise: sigma of the gravimeter, mGal.
+        initial: the position error at the start is within this on either axis, m.
+        seconds: of the epochs since the voyage began, shape (K,).
+        ins: the indicated track, its fields of shape (R, K).
+        measured: gravity anomaly, mGal, shape (R, K); NaN where there is none.
+        error: true position error of the INS, m north and east, shape (R, K, 2); None when it is not known.
+        route: the true track, shape (K,), or the indicated one when it is not known.
+    """
+
+    gravity_map: GravityMap
+    grade: Grade
+    noise: float
+    initial: float
+    seconds: Float
+    ins: Route
+    measured: Float
+    error: Float | None
+    route: Route
+
+    @property
+    def runs(self) -> int:
+        """R."""
+        return len(self.measured)
+
+    @property
+    def epochs(self) -> int:
+        """K."""
+        return len(self.seconds)
+
+    @property
+    def period(self) -> float:
+        """Time between epochs. Units: s."""
+        return float(self.seconds[1] - self.seconds[0])
+
+    def transitions(self, first: int, last: int) -> Float:
+        """Return the metric transitions from epoch k to k + 1, first <= k < last, shape (R, last - first, 12, 12).
+
+        At the indicated latitude and velocity, as a real filter has it.
+        """
+        return transitions(self.ins, first, last, self.period)
+
+    def prior(self) -> Float:
+        """Return the variances of the metric states at the start, shape (12,)."""
+        sigma = np.empty(STATES)
+        sigma[:2] = self.initial / math.sqrt(3.0)
+        sigma[2:4], sigma[4:6], sigma[6] = VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA
+        sigma[7:] = self.grade.biases()
+        return sigma**2
+
+    def anomaly(self, k: int, north: Float, east: Float) -> Float:
+        """Return the map's anomaly in mGal at epoch k for position errors in m, shape (R, ...); NaN off the map."""
+        shape = (self.runs,) + (1,) * (north.ndim - 1)
+        latitude = self.ins.latitude[:, k].reshape(shape)
+        meridian, parallel = metres_per_radian(latitude)
+        return self.gravity_map.at(
+            latitude - north / meridian, self.ins.longitude[:, k].reshape(shape) - east / parallel
+        )
+
+
+def transitions(route: Route, first: int, last: int, period: float) -> Float:
+    """Return the metric transitions along a track; see `Scenario.transitions`."""
+    motion = route.motion()
+    part = {name: getattr(motion, name)[..., first:last] for name in motion.__dataclass_fields__}
+    F = discretise(dynamics(type(motion)(**part)), period)
+    after = np.minimum(np.arange(first + 1, last + 1), len(route.seconds) - 1)
+    return metric(F, route.latitude[..., first:last], route.latitude[..., after])
+
+
+def simulate(
+    gravity_map: GravityMap,
+    plan: Plan,
+    grade: Grade,
+    *,
+    runs: range,
+    seed: int,
+    period: float = 10.0,
+    noise: float = 1.0,
+    initial: float = 2000.0,
+    believed: Grade | None = None,
+) -> Scenario:
+    """Return simulated runs: each draws its own INS errors and its own gravimeter noise.
+
+    Args:
+        gravity_map: true field and map at once, as in [depf2015] section 4.
+        plan: the voyage; grade: of the INS; believed: what the filters take it for, the same when None.
+        runs: their numbers; seed: of all random numbers.
+        period: between measurements, whole seconds; noise: sigma, mGal; initial: see `Scenario`.
+    """
+    route = planned(plan)
+    every = round(period)
+    x = ins_errors(plan, route, grade, Streams(seed, runs, INS_PURPOSE), every)
+    start = round(plan.filtered * SECONDS_PER_HOUR)
+    keep = start + every * np.arange(x.shape[1])
+    true = Route(
+        route.seconds[keep], *(v[keep] for v in (route.latitude, route.longitude, route.east, route.north))
+    )
+    ins = Route(
+        true.seconds,
+        true.latitude + x[:, :, 0],
+        true.longitude + x[:, :, 1],
+        true.east + x[:, :, 2],
+        true.north + x[:, :, 3],
+    )
+    meridian, parallel = metres_per_radian(ins.latitude)
+    error = np.stack([x[:, :, 0] * meridian, x[:, :, 1] * parallel], axis=-1)
+    anomaly = gravity_map.at(true.latitude, true.longitude)
+    drawn = Streams(seed, runs, GRAVITY_PURPOSE).normal(1, len(keep))[:, 0]
+    return Scenario(
+        gravity_map,
+        believed or grade,
+        noise,
+        initial,
+        true.seconds,
+        ins,
+        anomaly + noise * drawn,
+        error,
+        true,
+    )

@@ -1,0 +1,87 @@
+"""What a track is worth: errors, consistency and lock of every run, against the true position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.navigation.filters import Track
+from accelcal_cli.navigation.scenario import Scenario
+from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR
+from accelcal_cli.streams import Bool, Float
+
+SETTLED = 3.0
+"""Hour of the voyage from which errors count [depf2015] section 4."""
+
+ASTRAY = 0.1
+"""A run whose error is above the initial one for more than this part of the time has lost lock."""
+
+DIVERGED = 5.0
+"""A run whose last error is more than so many times the initial one has diverged."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of R runs over the epochs from hour 3 to the end; NaN where the true position is not known.
+
+    Attributes:
+        error: estimated - true position error of the INS, m north and east, shape (R, K, 2).
+        north, east, ins: mean squares of the error and of the INS alone, m^2, shape (R,).
+        nees: mean normalised error squared, 2 when the covariance is right, shape (R,).
+        sigma: root of the mean claimed variance, m, shape (R,).
+        lost: error above the initial one at the end, or for a tenth of the time; diverged: far above it at the end.
+    """
+
+    error: Float
+    north: Float
+    east: Float
+    ins: Float
+    nees: Float
+    sigma: Float
+    lost: Bool
+    diverged: Bool
+
+
+def counted(scenario: Scenario) -> Bool:
+    """Return which epochs count, shape (K,): those from hour 3, or all of a voyage that ends before."""
+    late: Bool = scenario.seconds >= SETTLED * SECONDS_PER_HOUR
+    return late if late.any() else np.ones_like(late)
+
+
+def score(scenario: Scenario, track: Track) -> Scores:
+    """Return the scores of a track."""
+    late = counted(scenario)
+    truth = np.full(track.mean.shape, np.nan) if scenario.error is None else scenario.error
+    error = track.mean - truth
+    square = np.square(error[:, late])
+    total = square.sum(axis=2)
+    ins = np.square(truth[:, late]).sum(axis=2).mean(axis=1)
+    variance = np.einsum("rkii->rk", track.covariance[:, late]).mean(axis=1)
+    blind = track.blind > 0.5 * scenario.epochs
+    known = scenario.error is not None
+    lost = ~np.isfinite(track.mean).all(axis=(1, 2)) | blind
+    far = np.square(track.mean[:, -1] - truth[:, -1]).sum(axis=1)
+    if known:
+        astray = ~(total <= scenario.initial**2)
+        lost = lost | astray[:, -1] | (astray.mean(axis=1) > ASTRAY)
+    diverged = lost & ~(far <= (DIVERGED * scenario.initial) ** 2) if known else lost
+    return Scores(
+        error,
+        square[..., 0].mean(axis=1),
+        square[..., 1].mean(axis=1),
+        ins,
+        _nees(error[:, late], track.covariance[:, late]),
+        np.sqrt(variance),
+        lost,
+        diverged,
+    )
+
+
+def _nees(error: Float, covariance: Float) -> Float:
+    """Return the mean of e^T P^-1 e, shape (R,); a cloud narrower than 1 mm counts as 1 mm."""
+    a, b, c = covariance[..., 0, 0] + 1e-6, covariance[..., 0, 1], covariance[..., 1, 1] + 1e-6
+    north, east = error[..., 0], error[..., 1]
+    value: Float = ((c * north - 2.0 * b * east) * north + a * east**2) / (a * c - b * b)
+    mean: Float = value.mean(axis=1)
+    return mean

@@ -1,0 +1,114 @@
+"""Pictures of a navigation study: the tracks over the map, and RMSE against time on either axis and in position."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accelcal_cli.navigation.bound import bound
+from accelcal_cli.output.files import whole_file
+from accelcal_cli.output.plot import _style
+from accelcal_cli.studies.navigation import Navigation, axis_of, curves, own
+from accelcal_cli.studies.study import Record
+
+HOUR = 3600.0
+PANELS = (
+    ("rmse_latitude_m", "latitude", 0),
+    ("rmse_longitude_m", "longitude", 1),
+    ("rmse_position_m", "position", None),
+)
+
+
+def plot_voyage(study: Navigation, records: Sequence[Record], path: str) -> None:
+    """Write the picture, whole or not at all: run 0's tracks, and the RMSE of all runs as [depf2015] figures 2 to 4.
+
+    Args:
+        study, records: what was run.
+        path: ends in .png or .svg.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(11.0, 8.5), layout="constrained")
+        panels = figure.subplots(2, 2).ravel()
+        labels = [_label(study, cell) for cell in range(study.cells)]
+        _draw_map(panels[0], study, records, labels)
+        _draw_errors(panels[1:], study, records, labels)
+        handles, names = panels[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
+        svg = Path(path).suffix == ".svg"
+        with whole_file(path, binary=True) as file:
+            figure.savefig(
+                file, format="svg" if svg else "png", dpi=130, metadata={"Date": None} if svg else {}
+            )
+
+
+def _label(study: Navigation, cell: int) -> str:
+    names = study.names(cell)
+    word = names["filter"] if names["mode"] == "default" else f"{names['filter']} ({names['mode']})"
+    return word if len(study.grades) == 1 else f"{word}, {float(names['accelerometer_ug']):.3g} micro-g"
+
+
+def _draw_map(axes: Any, study: Navigation, records: Sequence[Record], labels: list[str]) -> None:
+    """Draw the anomaly, the true and the indicated track, and where each filter puts run 0."""
+    scenario = study.waters.scenario(study.grades[0], range(1), study.seed)
+    grid = scenario.gravity_map
+    route = scenario.route
+    edges = np.degrees([grid.west, grid.east, grid.south, grid.north])
+    picture = axes.imshow(
+        grid.values,
+        origin="lower",
+        extent=edges,
+        cmap="Greys",
+        alpha=0.6,
+        aspect="auto",
+        interpolation="bilinear",
+    )
+    axes.figure.colorbar(picture, ax=axes, label="gravity anomaly, mGal", shrink=0.8)
+    axes.plot(np.degrees(route.longitude), np.degrees(route.latitude), color="black", lw=2.5, label="true")
+    ins = scenario.ins
+    axes.plot(
+        np.degrees(ins.longitude[0]),
+        np.degrees(ins.latitude[0]),
+        color="0.35",
+        lw=1.2,
+        ls=":",
+        label="INS alone",
+    )
+    for cell, label in enumerate(labels):
+        first = own(records, cell)[0]
+        axes.plot(axis_of(first, "longitude")[1], axis_of(first, "latitude")[1], label=label, **_style(cell))
+    for name, track in (("x", route.longitude), ("y", route.latitude)):
+        low, high = np.degrees(track.min()), np.degrees(track.max())
+        getattr(axes, f"set_{name}lim")(low - 0.12, high + 0.12)
+    axes.set(title="Run 0 over the map", xlabel="longitude, deg", ylabel="latitude, deg")
+
+
+def _draw_errors(panels: Any, study: Navigation, records: Sequence[Record], labels: list[str]) -> None:
+    """Draw RMSE against time of every cell, with the bound and the INS alone."""
+    table = curves(study, records).records()
+    scenario = study.waters.scenario(study.grades[0], range(min(study.repeats, 20)), study.seed)
+    least = bound(scenario)
+    hours = scenario.seconds / HOUR
+    keys = [
+        (n["filter"], n["mode"], float(n["accelerometer_ug"])) for n in map(study.names, range(study.cells))
+    ]
+    for axes, (key, name, axis) in zip(panels, PANELS, strict=True):
+        for cell, _ in enumerate(labels):
+            rows = [r for r in table if (r["filter"], r["mode"], r["accelerometer_ug"]) == keys[cell]]
+            points = [(r["seconds"] / HOUR, r[key]) for r in rows if r[key] is not None]
+            if points:
+                axes.plot(*zip(*points, strict=True), **_style(cell))
+        chosen = least.sum(axis=1) if axis is None else least[:, axis]
+        axes.plot(hours, np.sqrt(chosen), color="black", lw=1.0, ls="--")
+        axes.annotate("bound", (hours[-1], np.sqrt(chosen[-1])), fontsize=8, ha="right", va="top")
+        if scenario.error is not None:
+            square = np.square(scenario.error).mean(axis=0)
+            alone = square.sum(axis=1) if axis is None else square[:, axis]
+            axes.plot(hours, np.sqrt(alone), color="0.35", lw=1.2, ls=":")
+        axes.set(title=f"RMSE of {name}", xlabel="hour of the voyage", ylabel="m", yscale="log")
+        axes.grid(True, color="0.9", linewidth=0.6)

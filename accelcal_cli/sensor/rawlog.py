@@ -1,0 +1,188 @@
+"""A raw log: three accelerometer columns at a fixed rate, with time and three gyroscope columns where they exist."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor.cells import Rows
+from accelcal_cli.sensor.rawcolumns import RawColumns, choose_raw
+from accelcal_cli.sensor.tabular import Table, open_table
+
+Floats = NDArray[np.float64]
+
+PROBE = 1000
+"""Rows that tell the step of the time column, and whether a column without a name is one."""
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of a time column, in seconds."""
+
+SLOWEST = 1.0
+"""Hz: no raw log is slower, so a slower one is taken as being in a smaller unit of time."""
+
+
+@dataclass(frozen=True)
+class RawRows:
+    """A block of rows of a raw log.
+
+    Attributes:
+        numbers: acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, shape (B, k).
+        gyro, timed: which of them there are.
+    """
+
+    numbers: Floats
+    gyro: bool = False
+    timed: bool = False
+
+    @property
+    def time(self) -> Floats | None:
+        """Time of each row, shape (B,), as given."""
+        return self.numbers[:, -1] if self.timed else None
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the time column says.
+
+    Attributes:
+        rate: rows a second, Hz; None where nothing says it.
+        unit: of the time column: s, ms, us or ns.
+    """
+
+    rate: float | None = None
+    unit: str = "s"
+
+    @classmethod
+    def of(cls, time: Floats) -> Self:
+        """Tell rate and unit from the first rows. A step of exactly 1 counts rows and says nothing of time."""
+        steps = np.diff(time)
+        steps = steps[steps > 0]
+        if not len(steps) or (steps == 1).all():
+            return cls()
+        step = float(np.median(steps))
+        unit = next((unit for unit, size in UNITS.items() if step * size <= 1 / SLOWEST), "ns")
+        return cls(1.0 / (step * UNITS[unit]), unit)
+
+
+class RawLog:
+    """A raw log that is read once, from top to bottom."""
+
+    def __init__(self, table: Table, columns: RawColumns) -> None:
+        """Read the first rows of `table`: they tell what the time column is."""
+        self.name = table.name
+        self._table = table
+        self._rows = table.blocks(columns.selection())
+        self._head = _first(self._rows, PROBE)
+        self.columns = columns
+        self.clock = Clock()
+        self.notes = list(columns.notes)
+        self._settle_time()
+
+    def _settle_time(self) -> None:
+        """Take the time column for what it is: time, a row number, or no time at all."""
+        columns, times = self.columns, _column(self._head, -1)[:PROBE]
+        if columns.time is None:
+            return
+        steps = np.diff(times)
+        if columns.guessed and not (len(steps) and (steps >= 0).all() and (steps > 0).any()):
+            if columns.doubtful:
+                raise DataError(columns.doubtful)
+            self.columns = replace(columns, time=None)
+            return
+        self.clock = Clock.of(times)
+        if columns.guessed:
+            self.notes.append(f"column {columns.time + 1} taken as time: it never decreases")
+        if self.clock.rate is None:
+            self.columns = replace(columns, time=None)
+            self.notes.append(f"column {columns.time + 1} counts rows, it is no time")
+        elif self.clock.unit != "s":
+            self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows a second")
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the input, once all blocks have been read."""
+        return self._table.sha256
+
+    @property
+    def where(self) -> Callable[[int], str]:
+        """How to name a row (from 0) that has been read."""
+        return self._table.where
+
+    def blocks(self) -> Iterator[RawRows]:
+        """Yield the rows, block after block, in constant memory; time that goes back is a DataError."""
+        last = -np.inf
+        while self._head:
+            rows = self._head.pop(0)
+            raw = self._part(rows.numbers)
+            if raw.time is not None and len(raw.time):
+                self._check_time(raw.time, last, rows.start)
+                last = float(raw.time[-1])
+            yield raw
+            if not self._head:
+                self._head.extend(_first(self._rows, 1))
+
+    def close(self) -> None:
+        """Release the file."""
+        self._table.close()
+
+    def _part(self, numbers: Floats) -> RawRows:
+        sensors = 6 if self.columns.gyro else 3
+        timed = self.columns.time is not None
+        return RawRows(numbers[:, : sensors + timed], sensors == 6, timed)
+
+    def _check_time(self, time: Floats, last: float, start: int) -> None:
+        back = np.diff(time, prepend=last) < 0
+        if not back.any():
+            return
+        row = int(np.argmax(back))
+        before = time[row - 1] if row else last
+        raise DataError(
+            f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
+            "time that never decreases (--time none leaves it out)"
+        )
+
+
+def open_raw_log(
+    source: str | Path,
+    columns: Sequence[str] | None = None,
+    gyro: Sequence[str] | None = None,
+    time: str | None = None,
+    *,
+    stdin: BinaryIO | None = None,
+) -> RawLog:
+    """Open a raw log in any form that `read_readings` reads; ``-`` is standard input.
+
+    Args:
+        source: path, or ``-``.
+        columns, gyro: three columns each, by name or by number from 1; found by their names when None; no
+            gyroscope with `gyro` of ``["none"]``.
+        time: a column, ``"none"``, or None to find it.
+        stdin: standard input.
+    """
+    table = open_table(source, stdin)
+    try:
+        return RawLog(table, choose_raw(table, columns, gyro, time))
+    except BaseException:
+        table.close()
+        raise
+
+
+def _first(rows: Iterator[Rows], least: int) -> list[Rows]:
+    """Take blocks until they hold `least` rows, or all there are."""
+    taken: list[Rows] = []
+    while sum(len(block.numbers) for block in taken) < least:
+        block = next(rows, None)
+        if block is None:
+            break
+        taken.append(block)
+    return taken
+
+
+def _column(blocks: list[Rows], k: int) -> Floats:
+    return np.concatenate([np.empty(0), *(block.numbers[:, k] for block in blocks)])

@@ -1,0 +1,184 @@
+"""What a navigation study runs on: map, voyage, INS and gravimeter, from names, files and YAML."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.config import load_mapping, shipped
+from accelcal_cli.errors import ConfigError, DataError, did_you_mean
+from accelcal_cli.navigation.coverage import check_coverage
+from accelcal_cli.navigation.earth import MICRO_G
+from accelcal_cli.navigation.error_model import Grade
+from accelcal_cli.navigation.field import PRESETS, generate
+from accelcal_cli.navigation.filters import FILTERS, Filter
+from accelcal_cli.navigation.gravity_map import GravityMap
+from accelcal_cli.navigation.map_files import digest, load_map
+from accelcal_cli.navigation.scenario import Scenario, simulate
+from accelcal_cli.navigation.voyage import Plan, planned
+from accelcal_cli.navigation.voyage_file import read_voyage, recorded
+from accelcal_cli.registry import build, check, setting
+
+
+@dataclass(frozen=True)
+class Waters:
+    """Where and with what a study sails.
+
+    Attributes:
+        plan: the voyage; ins: its INS.
+    """
+
+    map: str = setting(
+        "rough", "rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, XYZ text"
+    )
+    map_seed: int | None = setting(None, "of a generated map; not set: the study's seed", low=0)
+    voyage: str = setting("", "CSV file of a recorded voyage; without one it is planned")
+    plan: Plan = field(default_factory=Plan, metadata={"doc": "the planned voyage"})
+    ins: Grade = field(default_factory=Grade, metadata={"doc": "the INS"})
+    period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
+    noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", above=0.0, high=1000.0)
+    initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
+    digests: tuple[str, ...] = field(default=(), metadata={"doc": "SHA-256 of the files"})
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
+        if self.period != round(self.period):
+            raise ConfigError(f"period: {self.period:g} s; expected whole seconds")
+
+    def hashed(self) -> Waters:
+        """Return the same with the hashes of its files, so that other contents are another study."""
+        files = [path for path in (self.map if self.map not in PRESETS else "", self.voyage) if path]
+        return replace(self, digests=tuple(digest(path) for path in files))
+
+    def gravity_map(self, seed: int) -> GravityMap:
+        """Return the map. Raises DataError when its file cannot be used."""
+        if self.map not in PRESETS:
+            if not Path(self.map).suffix and not Path(self.map).exists():
+                raise ConfigError(
+                    f'unknown map "{self.map}"{did_you_mean(self.map, PRESETS)}; known: {", ".join(PRESETS)}, '
+                    "or the path of a file"
+                )
+            return load_map(self.map)
+        return generate(PRESETS[self.map], seed if self.map_seed is None else self.map_seed, self.map)
+
+    def scenario(self, grade: Grade, runs: range, seed: int) -> Scenario:
+        """Return the scenario of some runs; the map must cover its track.
+
+        Raises:
+            DataError: a file that cannot be used, or a map that ends inside the track.
+        """
+        gravity_map = self.gravity_map(seed)
+        if self.voyage:
+            found = recorded(
+                read_voyage(self.voyage, self.period),
+                gravity_map,
+                grade,
+                self.noise,
+                self.initial,
+                runs,
+                seed,
+            )
+            check_coverage(gravity_map, found.route, self.initial)
+            return found
+        check_coverage(gravity_map, planned(self.plan), self.initial)
+        return simulate(
+            gravity_map, self.plan, grade, runs=runs, seed=seed,
+            period=self.period, noise=self.noise, initial=self.initial,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FilterEntry:
+    """A filter in a study: its label in the tables, its name, and what differs from its defaults."""
+
+    label: str
+    filter: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def build(self) -> Filter:
+        """Return the filter. Raises ConfigError when name or parameters are unknown."""
+        return FILTERS.build(self.filter, self.parameters, self.label)
+
+
+def filter_names() -> list[str]:
+    """Return the names of all filters, in the order in which the tables show them."""
+    order = ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
+    return sorted(FILTERS.names(), key=lambda name: order.index(name) if name in order else len(order))
+
+
+def limited(entry: FilterEntry, stated: Mapping[str, Any]) -> FilterEntry:
+    """Return a filter with what the command line states; a setting it does not have is left out.
+
+    Raises:
+        ConfigError: an unknown filter, or a value that it does not permit.
+    """
+    known = {f.name for f in fields(FILTERS.get(entry.filter))}  # type: ignore[arg-type]
+    own = {name: value for name, value in stated.items() if value is not None and name in known}
+    changed = replace(entry, parameters={**entry.parameters, **own})
+    changed.build()
+    return changed
+
+
+def load_waters(
+    path: Path | str | None, stated: Mapping[str, Any]
+) -> tuple[Waters, list[FilterEntry], dict[str, Any]]:
+    """Return waters, filters, and the remaining keys `runs`, `seed`, `title`, ... of a study's file.
+
+    Args:
+        path: YAML file, the name of a shipped study, or None.
+        stated: what the command line says instead.
+    """
+    files = shipped("studies")
+    file = files[path] if isinstance(path, str) and path in files else path
+    content = load_mapping(Path(file)) if file else {}
+    where = str(file) if file else "command line"
+    listed = content.pop("filters", [])
+    further = {key: content.pop(key) for key in FURTHER if key in content}
+    waters = build(Waters, {**content, **{k: v for k, v in stated.items() if v is not None}}, where)
+    if not isinstance(listed, list):
+        raise ConfigError(f"{where}: filters: expected a list of filters with their parameters")
+    entries = [_entry(item, f"{where}: filters[{n}]") for n, item in enumerate(listed, 1)]
+    return waters, entries, further
+
+
+FURTHER = ("title", "source", "note", "runs", "seed", "paper")
+"""Keys of a study's file that are not of its waters."""
+
+
+@dataclass(frozen=True)
+class _Stated:
+    filter: str
+    label: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def _entry(item: Any, where: str) -> FilterEntry:
+    if not isinstance(item, Mapping) or "filter" not in item:
+        raise ConfigError(f'{where}: expected a mapping with the key "filter"')
+    stated = build(_Stated, item, where)
+    FILTERS.build(stated.filter, stated.parameters, where)
+    return FilterEntry(stated.label or stated.filter, stated.filter, stated.parameters)
+
+
+def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
+    """Return an INS whose accelerometers are as good as a calibration says.
+
+    The sigma of D_a by the diagonal of K_a, root mean square over the axes, is the sigma of the bias.
+
+    Raises:
+        DataError: the calibration does not determine the biases.
+    """
+    sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(calibration.K_a))
+    if calibration.unit == "g":
+        sigma = sigma * 9.80665
+    value = float(np.sqrt(np.mean(np.square(sigma)))) / MICRO_G
+    if not math.isfinite(value) or value <= 0:
+        raise DataError(f"{where}: the calibration does not determine the biases ({calibration.verdict})")
+    return replace(grade, accelerometer=value)

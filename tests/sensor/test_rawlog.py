@@ -1,0 +1,140 @@
+"""Raw logs: which columns they have, what their time is, and where they are wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.sensor.rawlog import Clock
+from tests.sensor.raw_logs import opened, simulated, text
+
+LOG, _ = simulated(2, hold=4.0)
+A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]
+
+
+def read(log):
+    parts = [(raw.numbers, raw.time) for raw in log.blocks()]
+    log.close()
+    return np.concatenate([numbers for numbers, _ in parts])
+
+
+@pytest.mark.parametrize(
+    ("names", "columns", "gyro", "time"),
+    [
+        ("t,ax,ay,az", (1, 2, 3), None, 0),
+        ("ax,ay,az", (0, 1, 2), None, None),
+        ("time [s],acc_x,acc_y,acc_z,gyro_x,gyro_y,gyro_z", (1, 2, 3), (4, 5, 6), 0),
+        ("timestamp_ms,gx,gy,gz,accX,accY,accZ,mag_x", (4, 5, 6), (1, 2, 3), 0),
+        (
+            "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0],accelerometer_m_s2[1],"
+            "accelerometer_m_s2[2]",
+            (4, 5, 6),
+            (1, 2, 3),
+            0,
+        ),
+        ("seconds,wx,wy,ax,ay,az", (3, 4, 5), None, 0),
+    ],
+)
+def test_names_tell_the_columns(names, columns, gyro, time):
+    width = names.count(",") + 1
+    rows = np.arange(40.0).reshape(-1, 1) * 0.01 + np.zeros((1, width))
+    log = opened(text(rows, names))
+    assert (log.columns.output, log.columns.gyro, log.columns.time) == (columns, gyro, time)
+    log.close()
+
+
+@pytest.mark.parametrize(
+    ("parts", "columns", "gyro", "time"),
+    [
+        ([A], (0, 1, 2), None, None),
+        ([T, A], (1, 2, 3), None, 0),
+        ([A, W], (0, 1, 2), (3, 4, 5), None),
+        ([T, A, W], (1, 2, 3), (4, 5, 6), 0),
+    ],
+)
+def test_without_names_their_number_tells(parts, columns, gyro, time):
+    log = opened(text(np.hstack(parts), names=""))
+    assert (log.columns.output, log.columns.gyro, log.columns.time) == (columns, gyro, time)
+    assert "no header: columns" in log.notes[0]
+    np.testing.assert_allclose(read(log)[:, :3], A, rtol=1e-7)
+
+
+def test_a_first_column_that_decreases_is_no_time():
+    with pytest.raises(DataError, match=r"4 columns and no header, and the first is not time.*--columns"):
+        opened(text(np.hstack([W[:, :1], A]), names=""))
+    with pytest.raises(DataError, match="5 columns and no header; expected 3"):
+        opened(text(np.hstack([T, W[:, :1], A]), names=""))
+    log = opened(text(np.hstack([W[:, :1], A]), names=""), ["2", "3", "4"])
+    assert log.columns.time is None
+    log.close()
+
+
+def test_what_is_stated_wins():
+    data = text(np.hstack([T, A, W, A]), names="t,ax,ay,az,wx,wy,wz,bx,by,bz")
+    log = opened(data, ["bx", "by", "bz"], ["none"], "none")
+    assert (log.columns.output, log.columns.gyro, log.columns.time) == ((7, 8, 9), None, None)
+    assert log.columns.names == ("bx", "by", "bz")
+    log.close()
+    log = opened(data, ["8", "9", "10"], ["2", "3", "4"], "t")
+    assert (log.columns.output, log.columns.gyro, log.columns.time) == ((7, 8, 9), (1, 2, 3), 0)
+    log.close()
+    with pytest.raises(UsageError, match='--gyro: no column "wq"'):
+        opened(data, None, ["wq", "wy", "wz"])
+    with pytest.raises(UsageError, match='--time: no column "tt"'):
+        opened(data, None, None, "tt")
+    with pytest.raises(UsageError, match="asked for twice"):
+        opened(data, ["ax", "ay", "az"], ["ax", "ay", "az"])
+
+
+@pytest.mark.parametrize(
+    ("step", "rate", "unit"),
+    [(0.01, 100.0, "s"), (10, 100.0, "ms"), (2500, 400.0, "us"), (5e6, 200.0, "ns"), (0.5, 2.0, "s")],
+)
+def test_the_unit_of_time_is_told_by_its_step(step, rate, unit):
+    clock = Clock.of(1e4 + step * np.arange(50.0))
+    assert clock.rate == pytest.approx(rate, rel=1e-6)
+    assert clock.unit == unit
+
+
+def test_row_numbers_are_no_time():
+    rows = np.hstack([np.arange(1.0, len(A) + 1)[:, None], A])
+    log = opened(text(rows, names=""))
+    assert log.clock.rate is None
+    assert log.columns.time is None
+    assert any("counts rows" in note for note in log.notes)
+    np.testing.assert_allclose(read(log), A, rtol=1e-7)
+
+
+def test_time_that_goes_back_is_named_by_its_line():
+    back = T.copy()
+    back[700:] -= 5.0
+    log = opened(text(np.hstack([back, A]), names="t,ax,ay,az"))
+    with pytest.raises(DataError, match=r"<stdin>, line 702: time 2 comes after 6.99; expected.*--time none"):
+        read(log)
+    log.close()
+
+
+def test_time_may_stand_still():
+    """Loggers with coarse clocks write one time for several rows."""
+    coarse = np.round(T, 1)
+    assert len(read(opened(text(np.hstack([coarse, A]), names="t,ax,ay,az")))) == len(A)
+
+
+def test_a_bad_cell_is_named():
+    rows = text(np.hstack([T, A]), names="t,ax,ay,az").replace(b"\n0.05,", b"\n0.05,x", 1)
+    with pytest.raises(DataError, match='line 7, column "ax"'):
+        opened(rows)
+    with pytest.raises(DataError, match="has a header but no rows"):
+        opened(b"t,ax,ay,az\n")
+
+
+def test_parquet_reads_as_text_does(tmp_path):
+    import polars
+
+    from accelcal_cli.sensor.rawlog import open_raw_log
+
+    path = tmp_path / "log.parquet"
+    polars.DataFrame(np.hstack([T, A]), schema=["t", "ax", "ay", "az"]).write_parquet(path)
+    log = open_raw_log(path)
+    np.testing.assert_array_equal(read(log), np.hstack([A, T]))
