@@ -15,6 +15,7 @@ from accelcal_cli.cli import (
     apply,
     benchmark,
     calibrate,
+    capture,
     compare,
     detect,
     export,
@@ -63,6 +64,7 @@ app.command("simulate")(simulate.command)
 app.command("detect")(detect.command)
 app.command("apply")(apply.command)
 app.command("verify")(verify.command)
+app.command("capture")(capture.command)
 app.command("plan")(plan.command)
 app.command("report")(report.command)
 app.command("export")(export.command)
