@@ -78,14 +78,8 @@ def test_json_keeps_its_contract(run, good):
     assert set(result["sigma"]) == {"K_a", "D_a"}
     assert set(result["dop"]) == {"misalignment", "scale", "bias", "worst", "parameters"}
     assert len(result["dop"]["parameters"]) == 9
-    assert set(result["poses_fit"][0]) == {
-        "pose",
-        "where",
-        "residual",
-        "studentised",
-        "leverage",
-        "left_out",
-    }
+    pose = {"pose", "where", "residual", "residual_before", "direction"}
+    assert set(result["poses_fit"][0]) == {*pose, "studentised", "leverage", "left_out"}
     assert {"source", "sha256", "columns"} <= set(result["data"])
 
 
