@@ -18,7 +18,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73")
 """Okabe and Ito's blue, vermilion and green, which the colour-blind tell apart."""
 
 SHADE = "#F0E442"
-MOST_NUMBERS = 70
+MOST_NUMBERS = 110
 """An interval carries its number when it is at least as wide as this many side by side."""
 
 
