@@ -89,6 +89,20 @@ def best_poses(information: Float, candidates: Float, count: int) -> list[int]:
     return [int(kept[i]) for i in next_poses_of(information, candidates[kept])]
 
 
+def distinct_poses(candidates: Float, count: int) -> list[int]:
+    """Return the indices of a set of `count` different candidates, as good from nothing as `best_poses`, best first.
+
+    A set that wants a pose twice gets the best of the other candidates in its place.
+    """
+    chosen: list[int] = []
+    while len(chosen) < count:
+        left = [i for i in range(len(candidates)) if i not in chosen]
+        rows = design(candidates[chosen])
+        more = best_poses(rows.T @ rows, candidates[left], count - len(chosen))
+        chosen += dict.fromkeys(left[i] for i in more)
+    return chosen
+
+
 def next_poses_of(information: Float, directions: Float) -> list[int]:
     """Return the order in which to take all of some poses, shape (k, 3): each time the one that helps most."""
     left = list(range(len(directions)))

@@ -74,3 +74,9 @@ def check_tolerance(tolerance: float | None) -> None:
 def split_columns(text: str | None) -> list[str] | None:
     """Return the columns named with commas, or None when none were named."""
     return None if text is None else [part.strip() for part in text.split(",")]
+
+
+def check_positive(option: str, value: float) -> None:
+    """Raise UsageError when the value of an option is not a positive number."""
+    if not (math.isfinite(value) and value > 0):
+        raise UsageError(f"{option} {value:g}: expected a positive number")

@@ -20,6 +20,7 @@ from accelcal_cli.calibration.planner import (
     PRIOR,
     best_poses,
     candidates,
+    distinct_poses,
     dop_after,
     fixture_directions,
     next_poses,
@@ -274,3 +275,12 @@ def test_poses_that_cannot_be_enough_are_named_as_such():
     assert found.verdict == "undetermined"
     assert "misalignment xy, misalignment xz, misalignment yz" in pose_table(found).notes[-1]
     assert "all nine parameters" in pose_table(plan(np.zeros((9, 9)), 0, 1, "any", None)).notes[-1]
+
+
+@pytest.mark.parametrize("count", [1, 12, 20, 26])
+def test_distinct_poses_are_distinct(count):
+    allowed = candidates("corners")
+    chosen = distinct_poses(allowed, count)
+    assert len(chosen) == len(set(chosen)) == count
+    if count == 12:
+        assert _dop(allowed[chosen]).max() < 1.05

@@ -50,6 +50,7 @@ CONTRACT = {
     "notes": list,
     "version": str,
     "schema": str,
+    "temperature": (dict, type(None)),
 }
 """Names and types (or shapes) that programs rely on. A name that goes or changes needs a new schema."""
 
@@ -85,6 +86,8 @@ def test_json_keeps_its_contract(run, good):
         "studentised",
         "leverage",
         "left_out",
+        "residual_before",
+        "direction",
     }
     assert {"source", "sha256", "columns"} <= set(result["data"])
 

@@ -1,0 +1,102 @@
+"""`accelcal capture` from standard input: the table, how it ends, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accelcal_cli.calibration.planner import candidates, distinct_poses
+from accelcal_cli.streams import Streams
+
+FAST = ("--port", "-", "--rate", "20", "--window", "1", "--hold", "2")
+
+
+def stream(count, still=60):
+    """Lines of a sensor that jumps from pose to pose, in units of g."""
+    allowed = candidates("corners")
+    directions = allowed[distinct_poses(allowed, 12)][:count]
+    readings = np.repeat(directions, still, axis=0) + 0.001 * Streams(1, [0]).normal(count * still, 3)[0]
+    return "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in readings).encode()
+
+
+def test_poses_from_standard_input_calibrate(run, tmp_path):
+    done = run("capture", *FAST, "-o", "poses.csv", stdin=stream(12))
+    assert done.code == 0
+    assert done.out == ""
+    assert done.err.splitlines()[0] == "12 poses to take, in any order; each held still:"
+    assert done.err.splitlines()[-1] == "accelcal: 12 poses in poses.csv"
+    calibrated = run("calibrate", "poses.csv", "--g", "1", "--format", "csv")
+    assert calibrated.code == 0
+    assert "verdict,good" in calibrated.out
+
+
+def test_the_table_may_go_on_through_a_pipe(run):
+    done = run("capture", *FAST, "-q", stdin=stream(12))
+    assert (done.code, done.err) == (0, "")
+    rows = done.out.splitlines()
+    assert rows[0] == "pose,n,Nx,Ny,Nz,sx,sy,sz"
+    assert [row.split(",")[:2] for row in rows[1:]] == [[str(k), "40"] for k in range(1, 13)]
+
+
+def test_an_input_that_ends_early_exits_with_1(run, tmp_path):
+    done = run("capture", *FAST, "-o", "poses.csv", stdin=stream(5))
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == "accelcal: 5 poses in poses.csv, 7 planned are missing"
+    assert len((tmp_path / "poses.csv").read_text("utf-8").splitlines()) == 6
+
+
+def test_an_input_without_a_pose_leaves_no_file(run, tmp_path):
+    done = run("capture", *FAST, "-o", "poses.csv", stdin=stream(1, still=10))
+    assert done.code == 1
+    assert "no pose was taken, nothing is written" in done.err
+    assert not (tmp_path / "poses.csv").exists()
+
+
+def test_the_unit_and_the_offset_may_be_stated(run):
+    options = ("--unit", "g", "--offset", "0,0,0", "--still", "0.02", "--poses", "6", "--fixture", "faces")
+    done = run("capture", *FAST, *options, stdin=b"0 0 1\n" * 60 + b"0 0 -1\n" * 60)
+    assert done.code == 1
+    assert "pose 1: +z up; 40 readings, sd 0; 5 to take" in done.err
+    assert "pose 2: -z up; 40 readings, sd 0; 4 to take" in done.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "--port"),
+        (("--port", "nowhere"), "nowhere: cannot be opened"),
+        (("--port", "-", "--columns", "1,2"), '--columns "1,2": expected three different numbers'),
+        (("--port", "-", "--columns", "1,2,2"), "--columns"),
+        (("--port", "-", "--columns", "0,1,2"), "--columns"),
+        (("--port", "-", "--columns", "x,y,z"), "--columns"),
+        (("--port", "-", "--poses", "0"), "--poses"),
+        (("--port", "-", "--poses", "27"), "--poses 27: expected at most 26 with --fixture corners"),
+        (("--port", "-", "--poses", "7", "--fixture", "faces"), "at most 6 with --fixture faces"),
+        (("--port", "-", "--fixture", "any"), '--fixture "any": expected one of faces, edges, corners'),
+        (("--port", "-", "--rate", "0"), "--rate 0: expected a positive number"),
+        (("--port", "-", "--window", "nan"), "--window nan: expected a positive number"),
+        (("--port", "-", "--window", "0.001"), "expected 2 to 1,000,000 readings"),
+        (("--port", "-", "--hold", "1e9"), "expected 2 to 1,000,000 readings"),
+        (("--port", "-", "--still", "-1"), "--still -1: expected a positive number"),
+        (("--port", "-", "--timeout", "0"), "--timeout 0: expected a positive number"),
+        (("--port", "-", "--baud", "3"), "--baud"),
+        (("--port", "-", "--unit", "ft"), '--unit "ft": expected g, m/s2 or a positive number'),
+        (("--port", "-", "--unit", "0"), '--unit "0"'),
+        (("--port", "-", "--offset", "1,2"), '--offset "1,2": expected three numbers'),
+        (("--port", "-", "-o", "no/poses.csv"), "no such folder"),
+    ],
+)
+def test_bad_input_is_one_message_and_no_file(run, tmp_path, arguments, message):
+    done = run("capture", *arguments, *(() if "-o" in arguments else ("-o", "poses.csv")), stdin=stream(12))
+    assert (done.code, done.out) == (2, "")
+    assert message in done.err
+    assert "Traceback" not in done.err
+    assert done.err.splitlines()[-1].startswith("accelcal: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lines_without_numbers_are_refused(run, tmp_path):
+    done = run("capture", *FAST, "-q", "-o", "poses.csv", stdin=b"hello world\n" * 200)
+    assert done.code == 2
+    assert 'lines in a row without 3 numbers, as "hello world"' in done.err
+    assert list(tmp_path.iterdir()) == []
