@@ -29,6 +29,7 @@ import yaml
 
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
+from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.cli.main import app
 from accelcal_cli.optimizers.base import OPTIMIZERS
 from accelcal_cli.sensor.simulation import Sensor, Spread
@@ -348,7 +349,9 @@ def test_every_key_is_documented():
 def test_every_name_of_the_result_is_documented():
     text = (DOCS / "reference" / "result-file.md").read_text("utf-8")
     told = set(re.findall(r"^\| `(\w+)`", text, re.MULTILINE))
-    names = {f.name for cls in (Calibration, Sigma, Dop, PoseFit) for f in dataclasses.fields(cls)}
+    names = {
+        f.name for cls in (Calibration, Sigma, Dop, PoseFit, Temperature) for f in dataclasses.fields(cls)
+    }
     assert told == names
 
 

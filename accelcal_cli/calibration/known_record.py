@@ -77,7 +77,6 @@ def _assembled(
     low = model.in_gauge("lower")
     force = low.specific_force(readings.output())
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
-    rows = quality.design(directions)
     modulus = np.linalg.norm(force, axis=1) - np.linalg.norm(reference, axis=1)
     before, before_model = nominal_before(float(np.diagonal(model.K).mean()), model.D, settings)
     raw = np.linalg.norm(before_model.specific_force(readings.output()), axis=1) - g
@@ -107,7 +106,7 @@ def _assembled(
         noise_ratio=None,
         noise_chance=None,
         covariance=found.s**2 * cofactor,
-        information=rows.T @ rows,
+        information=np.linalg.pinv(cofactor),
         nominal_scale=np.diagonal(before_model.K).copy(),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=readings.poses,

@@ -1,0 +1,66 @@
+"""How often `accelcal verify` calls sensors changed: `python -m benchmarks.verify_level [sensors]`."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from accelcal_cli.calibration.chances import Noise, Pair, combined
+from accelcal_cli.calibration.quality import design
+from accelcal_cli.sensor import poses
+from accelcal_cli.streams import Float, Streams
+
+LEVEL = 0.05
+SETS = {
+    "12": poses.faces_edges(),
+    "24": poses.turns(),
+    "12 twice": np.repeat(poses.faces_edges(), 2, axis=0),
+    "60": poses.fibonacci(60),
+}
+CASES = (
+    *(
+        (old, new, 1.0, 0.0)
+        for old, new in (("12", "12"), ("24", "12"), ("24", "24"), ("12 twice", "12 twice"))
+    ),
+    ("60", "12", 1.0, 0.0),
+    *((old, new, 2.0, 0.0) for old, new in (("24", "24"), ("24", "12"), ("60", "12"))),
+    *(
+        (old, new, 1.0, 5.0)
+        for old, new in (("12", "12"), ("24", "24"), ("12 twice", "12 twice"), ("60", "24"))
+    ),
+)
+"""Poses of the old readings and the new, noise of the new over the old, shift of one bias in sigma."""
+
+
+def cofactor(u: Float) -> Float:
+    A = design(u)
+    return np.linalg.inv(A.T @ A)
+
+
+def rate(old: str, new: str, ratio: float, shift: float, sensors: int) -> float:
+    """Return the part that is called changed, of estimates drawn from their distribution."""
+    A, B, n_a, n_b = cofactor(SETS[old]), cofactor(SETS[new]), len(SETS[old]) - 9, len(SETS[new]) - 9
+    z = Streams(5, [0], purpose=3).normal(sensors, 9 + n_a + n_b)[0]
+    V = A + ratio**2 * B
+    d = z[:, :9] @ np.linalg.cholesky(V).T
+    d[:, 8] += shift * np.sqrt(V[8, 8])
+    a, b = (z[:, 9 : 9 + n_a] ** 2).mean(axis=1), ratio**2 * (z[:, 9 + n_a :] ** 2).mean(axis=1)
+    changed = 0
+    for j in range(sensors):
+        pair = Pair.of(Noise(float(a[j]), n_a), Noise(float(b[j]), n_b))
+        single = [pair.chance(d[j, [p]], A[[p]][:, [p]], B[[p]][:, [p]]) for p in range(9)]
+        changed += combined(np.array([*single, pair.chance(d[j], A, B)])) < LEVEL
+    return changed / sensors
+
+
+def main(sensors: int = 4000) -> None:
+    print("| old poses | new poses | noise, new / old | shift of one bias | called changed |")
+    print("| --- | --- | --- | --- | --- |")
+    for old, new, ratio, shift in CASES:
+        share = rate(old, new, ratio, shift, sensors)
+        print(f"| {old} | {new} | {ratio:g} | {shift:g} sigma | {share:.1%} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:2]))
