@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import re
@@ -14,9 +15,15 @@ import pytest
 
 import accelcal_cli
 from accelcal_cli.errors import AccelcalError, DataError
+from accelcal_cli.navigation.error_model import Grade
 from accelcal_cli.navigation.field import Field, generate
+from accelcal_cli.navigation.filters import FILTERS
 from accelcal_cli.navigation.map_files import load_map
+from accelcal_cli.navigation.voyage import Plan
 from accelcal_cli.navigation.voyage_file import read_voyage
+from accelcal_cli.studies.navigation import COLUMNS, beside
+from accelcal_cli.studies.voyages import Waters, load_waters
+from accelcal_cli.table import Table
 
 ROOT = Path(accelcal_cli.__file__).parents[1]
 SMALL = Field(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0)
@@ -252,3 +259,24 @@ def test_a_hole_in_the_map_near_the_track_is_refused(tmp_path, quick):
     assert "has a cell without a value" in navigate(
         "--config", quick, "--map", path, "--filter", "pf", "--runs", 1, code=2
     )
+
+
+def test_every_setting_of_a_filter_is_documented():
+    told = set(re.findall(r"`(\w+)`", (ROOT / "docs/reference/navigate.md").read_text("utf-8")))
+    for name in FILTERS.names():
+        settings = {field.name for field in dataclasses.fields(FILTERS.get(name))}  # type: ignore[arg-type]
+        assert settings <= told, name
+    for cls in (Waters, Plan, Grade):
+        assert {field.name for field in dataclasses.fields(cls)} - {"digests"} <= told
+    assert {column.key or column.name for column in COLUMNS} <= told
+
+
+def test_the_papers_numbers_stand_beside_ours():
+    study = load_waters("depf-rmse", {})
+    table = beside(
+        Table("", COLUMNS, tuple([(name, *[None] * (len(COLUMNS) - 1)) for name in ("PSO-PF", "de-pf")])),
+        study[2],
+    )
+    assert [row["paper_m"] for row in table.records()] == [370.7, 101.5]
+    assert study[2]["runs"] == 200
+    assert {entry.parameters.get("particles", 100) for entry in study[1]} == {100}

@@ -42,7 +42,8 @@ def rows_of(experiment):
 
 def test_every_experiment_of_the_papers_is_there():
     assert reproduce.names() == NAMES
-    assert [row[0] for row in reproduce.catalogue().rows] == NAMES
+    assert reproduce.voyages() == ["depf-rmse", "depf-roads"]
+    assert [row[0] for row in reproduce.catalogue().rows] == sorted([*NAMES, *reproduce.voyages()])
 
 
 @pytest.mark.parametrize("name", NAMES)
