@@ -115,24 +115,32 @@ def prepare(result: Calibration, table: Table, wanted: list[str] | None, wish: W
     taken = [name for name in wish.names if name in kept]
     if taken:
         raise DataError(f'{table.name}: has a column "{taken[0]}" already; choose another --prefix')
-    change = Change(
-        Selection(columns.output), _formula(result, wish), wish.names, columns.output if wish.replace else ()
-    )
-    return Log(table, change, _notes(columns))
+    warm = () if result.temperature is None or columns.temperature is None else (columns.temperature,)
+    places = columns.output if wish.replace else ()
+    change = Change(Selection((*columns.output, *warm)), _formula(result, wish), wish.names, places)
+    return Log(table, change, _notes(columns, result, used=bool(warm)))
 
 
-def _notes(columns: Columns) -> tuple[str, ...]:
-    return tuple(note for note in columns.notes if "taken as x, y, z" in note)
+def _notes(columns: Columns, result: Calibration, *, used: bool) -> tuple[str, ...]:
+    notes = [note for note in columns.notes if "taken as x, y, z" in note]
+    if result.temperature is not None and not used:
+        held = result.temperature.reference
+        notes.append(f"the log has no temperature column: its readings are taken to be at {held:.4g} degrees")
+    return tuple(notes)
 
 
 def _formula(result: Calibration, wish: Wish) -> Callable[[Float], Float]:
-    """Return the function from output, shape (B, 3), to the new columns, shape (B, k)."""
+    """Return the function from output, shape (B, 3), or with temperature, (B, 4), to the new columns, shape (B, k)."""
     own = "g" if result.unit == "g" else "m/s^2"
     factor = UNITS[wish.unit or own] / UNITS[own]
-    model, tilt = result.model, Tilt.of(result, wish.noise) if wish.tilt else None
+    model, warmth = result.model, result.temperature
+    tilt = Tilt.of(result, wish.noise) if wish.tilt else None
 
     def compute(numbers: Float) -> Float:
-        force = model.specific_force(numbers[:, :3])
+        output = numbers[:, :3]
+        if warmth is not None and numbers.shape[1] > 3:
+            output = warmth.at_reference(output, numbers[:, 3], model.D)
+        force = model.specific_force(output)
         scaled = force if factor == 1.0 else force * factor
         return scaled if tilt is None else np.concatenate([scaled, tilt.columns(force)], axis=1)
 

@@ -17,6 +17,7 @@ from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.robust import loss_weight, robust_variance
 from accelcal_cli.calibration.search import NO_NOISE, Solution, lower_problem, model_at
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.temperature import SLOPES, Slopes
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import describe
 from accelcal_cli.sensor.readings import Readings
@@ -41,19 +42,25 @@ CURVE_POINTS = 120
 
 
 def assemble(
-    readings: Readings, settings: Settings, start: Start, solution: Solution, weights: Float | None
+    readings: Readings,
+    settings: Settings,
+    start: Start,
+    solution: Solution,
+    weights: Float | None,
+    slopes: Slopes | None = None,
 ) -> Calibration:
-    """Return the calibration record of a solution."""
+    """Return the calibration record of a solution; with slopes, `readings` are those at the reference temperature."""
     g = settings.g
     found = model_at(solution.problem, solution.x)
     shown = found.in_gauge(settings.gauge)
     nine, point = lower_problem(solution.problem, found)
     low = ErrorModel(*(a[0] for a in nine.parameters(point)))
-    information = quality.information(nine, point)[0]
+    information = quality.information(nine, point)[0] - (0.0 if slopes is None else slopes.loss)
     seen = Observability.of(information, readings.poses)
-    freedom = readings.poses - 9
+    freedom = readings.poses - 9 - (0 if slopes is None else SLOPES)
     edge = _at_edge(solution)
-    before, before_model = _before(start, settings)
+    centre = start.box.centre[0]
+    before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
     fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
     variance = _variance(readings, settings, solution, low, weights, freedom)
     covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
@@ -99,6 +106,7 @@ def assemble(
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
         notes=(*readings.notes, *_notes(solution, start, settings, np.sqrt(variance), scale_sigma)),
         version=__version__,
+        temperature=None if slopes is None else slopes.temperature,
     )
 
 
@@ -151,23 +159,25 @@ def _suggest(information: Float, seen: Observability, poses: int) -> tuple[str, 
     return tuple(describe(candidates[i]) for i in chosen)
 
 
-def _before(start: Start, settings: Settings) -> tuple[str, ErrorModel]:
+def nominal_before(scale: float, D: Float, settings: Settings) -> tuple[str, ErrorModel]:
     """Return what the readings are taken for before calibration, in words and as a model.
 
     A stated nominal sensor; else, for readings that are specific force already, themselves; else one scale
     factor for all axes and the bias in the middle, which is what a user without calibration could do.
+
+    Args:
+        scale: mean scale factor, output units per m/s^2; D: bias, output units, shape (3,).
+        settings: may state a nominal sensor.
     """
-    centre = start.box.centre[0]
     if settings.nominal is not None:
         return "the stated nominal sensor", ErrorModel(
             np.diag(settings.nominal.scale), np.array(settings.nominal.bias)
         )
-    scale = _round(float(centre[:3].mean()))
+    scale = _round(scale)
     if 0.8 < scale < 1.25:  # specific force already, in m/s^2 or in g
         return "the readings as they are", ErrorModel(np.eye(3), np.zeros(3))
-    return "one scale factor for all axes and the estimated bias, no misalignment", ErrorModel(
-        scale * np.eye(3), centre[-3:]
-    )
+    words = "one scale factor for all axes and the estimated bias, no misalignment"
+    return words, ErrorModel(scale * np.eye(3), D)
 
 
 def _round(value: float) -> float:

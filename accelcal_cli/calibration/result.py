@@ -11,6 +11,7 @@ import numpy as np
 
 from accelcal_cli.calibration import record as records
 from accelcal_cli.calibration.quality import Verdict
+from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.model import GAUGES, ErrorModel
 from accelcal_cli.streams import Float
@@ -91,6 +92,7 @@ class Calibration:
         optimizer: its name; settings: everything needed to repeat the run.
         data: source, sha256, columns of the readings.
         notes: sentences about the data and the search that a user should know.
+        temperature: slopes with temperature, when the readings determine them.
     """
 
     K_a: Float
@@ -130,6 +132,7 @@ class Calibration:
     notes: tuple[str, ...]
     version: str
     schema: str = SCHEMA
+    temperature: Temperature | None = None
 
     @property
     def model(self) -> ErrorModel:
@@ -167,6 +170,7 @@ class Calibration:
         """
         if record.get("schema") != SCHEMA:
             raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
+        record = {"temperature": None, **record}
         missing = [f.name for f in fields(cls) if f.name not in record]
         if missing:
             raise DataError(f"{where}: not a whole calibration result; missing: {', '.join(missing)}")
@@ -217,6 +221,8 @@ def _rebuild(name: str, value: Any) -> Any:
         raise ValueError(f"{value!r} is not one of {', '.join(CHOICES[name])}")
     if name == "g" and not 0 < records.of_kind(value, (int, float), "a positive number") < math.inf:
         raise ValueError(f"{value!r} where a positive number was expected")
+    if name == "temperature" and value is not None:
+        return Temperature.from_record(value)
     if name == "dop":
         parameters = {key: records.or_infinite(v) for key, v in value["parameters"].items()}
         kinds = {

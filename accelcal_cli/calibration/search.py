@@ -80,6 +80,15 @@ def polish(problem: Loetters, x: Float) -> Run:
     return minimize(problem, solver, runs=len(x), start=x[:, None, :], trace=False)
 
 
+def resolve(solution: Solution, problem: Loetters) -> Solution:
+    """Return a solution carried over to a problem that differs a little: polished from where it was."""
+    polished = polish(problem, solution.x)
+    evaluations = solution.evaluations + int(polished.evaluations.sum())
+    return replace(
+        solution, problem=problem, x=polished.x, cost=float(polished.cost[0]), evaluations=evaluations
+    )
+
+
 def reweight(solution: Solution, readings: Readings, settings: Settings, weights: Float | None) -> Solution:
     """Solve again under the robust loss: weights from the residuals, residuals from the weights."""
     g, triangle = settings.g, solution.problem.triangle

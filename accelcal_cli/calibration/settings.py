@@ -14,6 +14,8 @@ from accelcal_cli.sensor.units import STANDARD_GRAVITY
 Robust = Literal["none", "huber", "soft-l1"]
 Weights = Literal["none", "n", "sd", "auto"]
 
+Attitudes = Literal["unknown", "known"]
+
 LARGEST = 1e30
 """Largest scale factor or bias of a nominal sensor, output units: its fourth power is still a number."""
 
@@ -65,6 +67,8 @@ class Settings:
         "none",
         "weight of a pose: none, n (readings averaged), sd (their scatter and n) or auto (sd beside a shared error)",
     )
+    attitudes: Attitudes = setting("unknown", "known: all twelve parameters, from columns fx, fy, fz")
+    temperature: bool = setting(True, "slopes with temperature, where a temperature column determines them")
     box: BoxSettings = field(default_factory=BoxSettings)
     nominal: Nominal | None = setting(None, "stated nominal sensor; estimated when left out")
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from accelcal_cli.calibration.quality import UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.sensor import units
 from accelcal_cli.sensor.poses import AXES
 from accelcal_cli.table import Column, Table
@@ -17,7 +18,15 @@ UNKNOWN = "not determined"
 
 def tables(result: Calibration) -> list[Table]:
     """Return every table of a result, in reading order."""
-    return [parameters(result), engineering(result), fit(result), observability(result), worst_poses(result)]
+    warmth = [] if result.temperature is None else [temperature(result, result.temperature)]
+    return [
+        parameters(result),
+        engineering(result),
+        *warmth,
+        fit(result),
+        observability(result),
+        worst_poses(result),
+    ]
 
 
 def parameters(result: Calibration) -> Table:
@@ -34,7 +43,7 @@ def parameters(result: Calibration) -> Table:
     for name in ("K_x", "K_y", "K_z", "bias"):
         columns += [Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}")]
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
-    if result.gauge == "full":
+    if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
             "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
             "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
@@ -129,6 +138,35 @@ def _reference(result: Calibration) -> str:
         f"Scale-factor errors against {nominal} output units per {result.unit}, biases against {offset} output units. "
         "Misalignment: the angle by which two sensor axes miss 90 degrees."
     )
+
+
+def temperature(result: Calibration, slopes: Temperature) -> Table:
+    """Return the change of scale factors and biases per degree."""
+    force = units.MICRO_G / np.diagonal(result.model.in_gauge("lower").K) / result.g
+    rows = [
+        (
+            f"scale factor {AXES[i]}",
+            slopes.scale[i] * units.PPM,
+            slopes.sigma_scale[i] * units.PPM,
+            "ppm per degree",
+        )
+        for i in range(3)
+    ]
+    rows += [
+        (f"bias {AXES[i]}", slopes.bias[i] * force[i], slopes.sigma_bias[i] * force[i], "micro-g per degree")
+        for i in range(3)
+    ]
+    columns = (
+        Column("parameter"),
+        Column("slope", format=",.2f"),
+        Column("sigma", format=",.2f"),
+        Column("unit"),
+    )
+    note = (
+        f"The other parameters hold at {slopes.reference:.4g} degrees; the poses went from {slopes.low:.4g} to "
+        f"{slopes.high:.4g}."
+    )
+    return Table("Temperature", columns, tuple(rows), (note,))
 
 
 def fit(result: Calibration) -> Table:

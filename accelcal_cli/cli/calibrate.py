@@ -48,6 +48,16 @@ def command(
         str | None,
         typer.Option(help="Weight of a pose: none, n, sd or auto.", show_default="none; auto with --raw"),
     ] = None,
+    attitudes: Annotated[
+        str | None,
+        typer.Option(help="unknown, or known: from columns fx, fy, fz.", show_default="unknown"),
+    ] = None,
+    temperature: Annotated[
+        bool | None,
+        typer.Option(
+            help="Slopes with temperature, if a column determines them.", show_default="temperature"
+        ),
+    ] = None,
     polish: Annotated[
         bool | None, typer.Option(help="Finish by Levenberg-Marquardt.", show_default="polish")
     ] = None,
@@ -98,6 +108,8 @@ def command(
         "robust": robust,
         "weights": weights,
         "polish": polish,
+        "attitudes": attitudes,
+        "temperature": temperature,
     }
     parameters = {"population": population, "iterations": iterations}
     stated = {k: v for k, v in overrides.items() if v is not None}

@@ -13,7 +13,7 @@ from accelcal_cli.cli import options
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.detection import Detection
+    from accelcal_cli.calibration.detection import Detection, DetectSettings
 
 LARGEST_MULTIPLIER = 1e6
 LARGEST_RATE = 1e6
@@ -104,15 +104,30 @@ def find_poses(
         g: local gravity, m/s^2.
         picture: keep what a picture of the log needs.
     """
-    from accelcal_cli.calibration.detection import MULTIPLIERS, DetectSettings, detect
+    from accelcal_cli.calibration.detection import detect
     from accelcal_cli.sensor.rawlog import open_raw_log
-    from accelcal_cli.sensor.spans import Spans, parse_span
 
     options.check_input(data)
+    settings = _settings(chosen, g)
+    log = open_raw_log(
+        data, _split(columns), _split(chosen.get("gyro")), chosen.get("time"), stdin=sys.stdin.buffer
+    )
+    try:
+        return detect(log, settings, picture)
+    finally:
+        log.close()
+
+
+def _settings(chosen: Mapping[str, Any], g: float) -> DetectSettings:
+    from accelcal_cli.calibration.detection import MULTIPLIERS, DetectSettings
+    from accelcal_cli.sensor.spans import Spans, parse_span
+
+    if "merge" in chosen and "thin" in chosen:
+        raise UsageError("--merge and --thin: expected one of them, not both")
     names = ("window", "still", "min_length", "trim")
     spans = [parse_span(chosen.get(name), f"--{name.replace('_', '-')}") for name in names]
     multipliers = chosen.get("multiplier")
-    settings = DetectSettings(
+    return DetectSettings(
         spans=Spans(*spans),
         rate=_between("--rate", chosen.get("rate"), LARGEST_RATE, "rows a second"),
         multipliers=MULTIPLIERS if multipliers is None else _multipliers(multipliers),
@@ -121,15 +136,6 @@ def find_poses(
         least_poses=chosen.get("min_poses", DetectSettings.least_poses),
         g=g,
     )
-    if settings.merge is not None and settings.thin is not None:
-        raise UsageError("--merge and --thin: expected one of them, not both")
-    log = open_raw_log(
-        data, _split(columns), _split(chosen.get("gyro")), chosen.get("time"), stdin=sys.stdin.buffer
-    )
-    try:
-        return detect(log, settings, picture)
-    finally:
-        log.close()
 
 
 def _split(text: str | None) -> Sequence[str] | None:

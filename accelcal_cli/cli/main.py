@@ -108,6 +108,7 @@ def main() -> None:
     except OSError as error:
         if error.errno == errno.EPIPE:
             _leave_pipe()
+        _drop_output()
         _fail(f"cannot write: {(error.strerror or str(error)).lower()}", BAD_INPUT)
     except MemoryError:
         _fail("not enough memory for this input", BAD_INPUT)
@@ -141,5 +142,10 @@ def _fail(message: str, code: int) -> NoReturn:
 
 def _leave_pipe() -> NoReturn:
     """Leave quietly when the reader of our output has gone, as `head` does."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    _drop_output()
     sys.exit(0)
+
+
+def _drop_output() -> None:
+    """Lead what is still buffered for standard output nowhere, or Python would complain of it at its exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -50,17 +50,22 @@ def forces(x: Float, fitness: Float) -> Float:
     Args:
         x: shape (R, N, 2); fitness: shape (R, N), larger is better; the best feels none.
     """
+    runs, count = fitness.shape
     order = np.argsort(-fitness, axis=1, kind="stable")
-    mass = np.take_along_axis(masses(fitness), order, axis=1)
-    place = np.take_along_axis(x, order[:, :, None], axis=1)
-    moment = mass[:, :, None] * place
-    better_mass, better_moment = np.cumsum(mass, axis=1) - mass, np.cumsum(moment, axis=1) - moment
-    total_mass, total_moment = mass.sum(axis=1, keepdims=True), moment.sum(axis=1, keepdims=True)
-    worse_mass = total_mass - better_mass - mass
-    pull = better_moment - better_mass[:, :, None] * place
-    push = total_moment - better_moment - moment - worse_mass[:, :, None] * place
-    sorted_force = (pull - push) / total_mass[:, :, None]
-    sorted_force[:, 0] = 0.0
-    force: Float = np.empty_like(sorted_force)
-    np.put_along_axis(force, order[:, :, None], sorted_force, axis=1)
-    return force
+    flat = order + count * np.arange(runs)[:, None]
+    mass = masses(fitness).ravel()[flat]
+    better = np.cumsum(mass, axis=1) - mass
+    total = mass.sum(axis=1, keepdims=True)
+    worse = total - better - mass
+    force = np.empty((runs, 2, count))
+    for axis in (0, 1):
+        place = np.ascontiguousarray(x[..., axis]).ravel()[flat]
+        moment = mass * place
+        below = np.cumsum(moment, axis=1) - moment
+        above = moment.sum(axis=1, keepdims=True) - below - moment
+        push = (below - better * place - above + worse * place) / total
+        push[:, 0] = 0.0
+        own = np.empty(runs * count)
+        own[flat] = push
+        force[:, axis] = own.reshape(runs, count)
+    return force.swapaxes(1, 2)

@@ -55,12 +55,15 @@ class DePf(Evolving):
         operators = Operators(self.F_min, self.F_max, self.CR_min, self.CR_max, self.mutation)
         return evolve(operators, x, fitness, movers, self.generations, rate, streams)
 
+    @property
+    def memory(self) -> int:
+        """Epochs that the fitness looks at."""
+        return self.window if self.road == "window" else 1
+
     def fitness(self, scenario: Scenario, k: int, position: Float) -> Float:
         """Return the likelihood of one measurement, or of the last W as if the error had not changed."""
-        if self.road != "window":
-            return self.likelihood(scenario, k, position)
         total = np.zeros(position.shape[:2])
-        for epoch in range(max(0, k - self.window + 1), k + 1):
+        for epoch in range(k + 1 - min(k + 1, self.memory), k + 1):
             total += self.likelihood(scenario, epoch, position)
         return total
 

@@ -39,7 +39,9 @@ UNEXPLAINED = 4.0
 """Least mean misfit squared over R at which no track explains a window: by chance once in 60 000 windows of ten."""
 
 SWELL = 4.0
-"""By so much the covariance grows then: the cloud is at a wrong place, or too narrow."""
+"""By so much the covariance grows then: the cloud is at a wrong place, or too narrow.
+
+It does not grow beyond the initial error."""
 
 TINY = 1e-12
 
@@ -130,7 +132,8 @@ class Marginal:
         level = np.take_along_axis(likelihoods.sum(axis=1), chosen, axis=1)
         misfit = -2.0 * likelihoods.sum(axis=1).max(axis=1)
         u, mean, covariance = self._moved(scenario, window, (u, level, edge), streams)
-        lost = (misfit > UNEXPLAINED * (last - first)) & math.isinf(edge)
+        wide = np.square(state.root[:, :2, :2]).sum(axis=(1, 2)) > scenario.initial**2
+        lost = (misfit > UNEXPLAINED * (last - first)) & math.isinf(edge) & ~wide
         swell = np.where(lost, SWELL, 1.0)
         return carried(window, state, (mean, self.inflation * covariance, swell), u, streams)
 

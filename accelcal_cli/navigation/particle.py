@@ -150,20 +150,27 @@ class Evolving(Sir):
         self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
     ) -> tuple[Cloud, Float, int, Bool]:
         """Return the cloud evolved and weighed; see `Sir.update`."""
-        prior = normalised(cloud.log_weights)
         old = cloud
         cloud, weights, used, seen = super().update(scenario, cloud, k, streams)
-        low = effective_size(weights) < self.threshold * self.particles
-        if not self.generations or not (self.mode == "literal" or low.any()):
+        if not self.generations:
             return cloud, weights, used, seen
         if self.mode == "literal":
             moved = self._literal(scenario, old, k, streams)
-            movers = self.particles
-        else:
-            moved, movers = self._safe(scenario, cloud, prior, k, streams)
-            x = np.where(low[:, None, None], moved.x, cloud.x)
-            moved = Cloud(x, np.where(low[:, None], moved.log_weights, cloud.log_weights))
-        return moved, normalised(moved.log_weights), used + movers * self.generations, seen
+            return moved, normalised(moved.log_weights), used + self.particles * self.generations, seen
+        rows = np.flatnonzero(effective_size(weights) < self.threshold * self.particles)
+        if len(rows):
+            part = Cloud(cloud.x[rows], cloud.log_weights[rows])
+            prior = normalised(old.log_weights[rows])
+            now = scenario.instant(rows, max(0, k + 1 - self.memory), k + 1)
+            part, movers = self._safe(now, part, prior, now.epochs - 1, streams.take(rows))
+            cloud.x[rows], cloud.log_weights[rows] = part.x, part.log_weights
+            used += round(movers * self.generations * len(rows) * now.epochs / scenario.runs)
+        return cloud, normalised(cloud.log_weights), used, seen
+
+    @property
+    def memory(self) -> int:
+        """Epochs that the fitness looks at."""
+        return 1
 
     def _literal(self, scenario: Scenario, old: Cloud, k: int, streams: Streams) -> Cloud:
         def rate(position: Float) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from accelcal_cli.navigation.earth import metres_per_radian
 from accelcal_cli.navigation.error_model import STATES, Grade, discretise, dynamics, metric
 from accelcal_cli.navigation.gravity_map import GravityMap
 from accelcal_cli.navigation.voyage import INS_PURPOSE, SECONDS_PER_HOUR, Plan, Route, ins_errors, planned
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Float, Int, Streams
 
 GRAVITY_PURPOSE = 22
 VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA = 0.6, 1e-4, 1e-3
@@ -73,6 +73,19 @@ class Scenario:
         sigma[2:4], sigma[4:6], sigma[6] = VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA
         sigma[7:] = self.grade.biases()
         return sigma**2
+
+    def instant(self, rows: Int, first: int, last: int) -> Scenario:
+        """Return epochs `first` to `last` - 1 of some runs."""
+        ins = Route(
+            self.seconds[first:last],
+            *(
+                v[rows, first:last]
+                for v in (self.ins.latitude, self.ins.longitude, self.ins.east, self.ins.north)
+            ),
+        )
+        return replace(
+            self, seconds=ins.seconds, ins=ins, measured=self.measured[rows, first:last], error=None
+        )
 
     def anomaly(self, k: int, north: Float, east: Float) -> Float:
         """Return the map's anomaly in mGal at epoch k for position errors in m, shape (R, ...); NaN off the map."""

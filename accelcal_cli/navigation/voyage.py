@@ -42,7 +42,7 @@ class Plan:
     longitude: float = setting(115.2, "of the start, degrees", low=-360.0, high=360.0)
     heading: float = setting(70.0, "clockwise from north, degrees", low=-360.0, high=360.0)
     speed: float = setting(8.0, "over ground, m/s", low=0.0, high=300.0)
-    hours: float = setting(8.0, "duration", above=0.0, high=48.0)
+    hours: float = setting(8.0, "duration, h", above=0.0, high=48.0)
     filtered: float = setting(2.0, "hour at which the filter starts", low=0.0, high=47.0)
     turn: float = setting(-90.0, "in the middle of the voyage, degrees", low=-360.0, high=360.0)
     turning: float = setting(600.0, "duration of the turn, s", above=0.0, high=36000.0)
@@ -147,11 +147,12 @@ def _aligned(plan: Plan, route: Route, grade: Grade, streams: Streams, steps: Fl
     for step in steps:
         transition = step @ transition
     scale = metres_per_radian(route.latitude[len(steps)])
+    level = float(specific_force(route.motion())[2][0]), float(route.latitude[0])
     found = np.empty((len(streams), STATES))
     for run in range(len(streams)):
         stream = streams.take(np.array([run]))
         for _ in range(TRIES):
-            x = _alignment(route, stream.normal(1, 5)[0, 0] * grade.biases())
+            x = _alignment(level, stream.normal(1, 5)[0, 0] * grade.biases())
             after = transition @ x
             if plan.drift[0] <= math.hypot(after[0] * scale[0], after[1] * scale[1]) <= plan.drift[1]:
                 break
@@ -165,11 +166,11 @@ def _aligned(plan: Plan, route: Route, grade: Grade, streams: Streams, steps: Fl
     return found
 
 
-def _alignment(route: Route, biases: Float) -> Float:
-    """Return the errors, shape (12,), that self-alignment with such biases leaves."""
-    up = specific_force(route.motion())[2][0]
+def _alignment(level: tuple[float, float], biases: Float) -> Float:
+    """Return the errors, shape (12,), that self-alignment leaves; `level`: force up (m/s^2), latitude (rad)."""
+    up, latitude = level
     x = np.zeros(STATES)
     x[7:] = biases
     x[4], x[5] = -biases[1] / up, biases[0] / up
-    x[6] = biases[2] / (EARTH_RATE * math.cos(route.latitude[0]))
+    x[6] = biases[2] / (EARTH_RATE * math.cos(latitude))
     return x

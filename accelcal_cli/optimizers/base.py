@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.problem import Bound, Problem
+from accelcal_cli.problem import Bound, Problem, points
 from accelcal_cli.registry import Registry, check, setting
 from accelcal_cli.streams import Float, Int, Streams
 
@@ -42,9 +42,16 @@ S = TypeVar("S", bound=State)
 
 
 def take(state: S, index: Int) -> S:
-    """Return the state of the runs at `index`; every array field has the runs as its first axis."""
+    """Return the state of the runs at `index`; every array in it and its parts has the runs as its first axis."""
     parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
-    return dataclasses.replace(state, **{k: v[index] for k, v in parts.items() if isinstance(v, np.ndarray)})
+    return dataclasses.replace(state, **{k: _taken(v, index) for k, v in parts.items()})
+
+
+def _taken(part: Any, index: Int) -> Any:
+    if isinstance(part, np.ndarray):
+        return part[index]
+    held: Any = part if dataclasses.is_dataclass(part) else None
+    return part if held is None else take(held, index)
 
 
 @dataclass(frozen=True)
@@ -89,6 +96,9 @@ OPTIMIZERS: Registry[Optimizer] = Registry("accelcal_cli.optimizers", "optimizer
 def gather(x: Float, index: Int) -> Float:
     """Return points of each run's population counted round: x (R, P, D) at index (R, Q) modulo P, (R, Q, D)."""
     flat = x.transpose(0, 2, 1)
+    if len(flat) == 1:
+        only: Float = flat[0].take(index[0], axis=1, mode="wrap")[None]
+        return only.transpose(0, 2, 1)
     out = np.empty((*flat.shape[:2], index.shape[1]))
     for source, columns, target in zip(flat, index, out, strict=True):
         source.take(columns, axis=1, out=target, mode="wrap")
@@ -112,8 +122,7 @@ def better_of(x: Float, fx: Float, new: Float, new_cost: Float) -> tuple[Float, 
 
 def best_of(x: Float, fx: Float) -> Float:
     """Return each run's best point, shape (R, D)."""
-    best: Float = x[np.arange(len(fx)), fx.argmin(axis=1)]
-    return best
+    return points(x, fx.argmin(axis=1))
 
 
 def integers(u: Float, *below: int) -> Int:

@@ -27,7 +27,20 @@ from accelcal_cli.optimizers.de import mutates
 from accelcal_cli.optimizers.pso import velocity
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Float, Int, Streams
+
+AHEAD = 1600
+"""Points whose chances are drawn at once: several iterations of a small batch. Each run draws its own in the order
+of its iterations, so that they do not depend on its company."""
+
+
+@dataclass(frozen=True)
+class Chances:
+    """What chance decides in K iterations."""
+
+    r: Float  # uniform numbers of the swarm, (R, K, P/2, 2 D)
+    picks: Int  # partners n and m of the individuals, modulo their number, and J_rand, (R, K, 3, P/2)
+    taken: Float  # 1 where a trial takes the mutant's gene, 0 where its parent's, (R, K, P/2, D)
 
 
 @dataclass(frozen=True)
@@ -39,6 +52,8 @@ class HybridState(State):
     memory_cost: Float  # (R, P)
     leader: Float  # common best, (R, D)
     iteration: int
+    ahead: int = 0  # iterations drawn and not yet made, the last of the K
+    chances: Chances | None = None
 
 
 @OPTIMIZERS.register("de-pso")
@@ -74,47 +89,68 @@ class HybridSwarm(Optimizer):
 
     def step(self, problem: Problem, state: HybridState, rng: Streams) -> HybridState:
         """Move both halves once; one call evaluates them together."""
-        x, half = np.empty_like(state.x), state.velocity.shape[1]
-        u = rng.uniform(x.shape[1] - half, 3 * x.shape[2] + 3)
+        ahead, chances = state.ahead, state.chances
+        if chances is None:
+            ahead = max(1, min(AHEAD // state.fx.size, self.iterations - state.iteration))
+            chances = self._draw(state, ahead, rng)
+        x, v = self._moved(problem, state, chances, -ahead)
+        ahead, chances = (ahead - 1, chances) if ahead > 1 else (0, None)
+        fx = problem.cost(x)
+        memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
+        leader, k = best_of(memory, memory_cost), state.iteration + 1
+        return HybridState(x, fx, v, memory, memory_cost, leader, k, ahead, chances)
+
+    def _moved(self, problem: Problem, state: HybridState, chances: Chances, k: int) -> tuple[Float, Float]:
+        """Return both halves' next points and the swarm's velocities by the k-th chances."""
+        x, half, curve = np.empty_like(state.x), state.velocity.shape[1], self._curve(state.iteration)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
-        curve = self._curve(state.iteration)
-        v = self._velocity(state, u, curve)
+        v = self._velocity(state, chances.r[:, k], curve)
         press(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
         individuals = state.memory[:, half:].copy(order="K")
-        np.add(individuals, self._change(individuals, state.leader, u, curve), out=x[:, half:])
+        change = self._change(individuals, state.leader, chances.picks[:, k], curve)
+        change *= chances.taken[:, k]  # [dpso2014] eq. 5
+        np.add(individuals, change, out=x[:, half:])
         press(x, low, high)
-        fx = problem.cost(x)
-        memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
-        leader = best_of(memory, memory_cost)
-        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1)
+        return x, v
+
+    def _draw(self, state: HybridState, steps: int, rng: Streams) -> Chances:
+        """Return the chances of the next steps."""
+        runs, population, dimensions = state.x.shape
+        half = state.velocity.shape[1]
+        rest, columns = population - half, 3 * dimensions + 3
+        u = rng.uniform(rest, steps * columns).transpose(0, 2, 1).reshape(-1, columns, rest)
+        u = u.transpose(0, 2, 1)
+        picks = integers(u[..., -3:], rest - 1, rest - 2, dimensions)
+        taken = mutates(u[..., 2 * dimensions : -3], self.crossover, picks[:, 2]).astype(float)
+        partners(picks)
+        r, shape = u[:, :half, : 2 * dimensions], (runs, steps)
+        return Chances(
+            r.reshape(*shape, half, -1), picks.reshape(*shape, 3, rest), taken.reshape(*shape, rest, -1)
+        )
 
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
         return float(1.0 / (1.0 + self.curve_a * self.curve_b ** (100.0 * iteration / self.iterations)))
 
-    def _velocity(self, state: HybridState, u: Float, curve: float) -> Float:
+    def _velocity(self, state: HybridState, r: Float, curve: float) -> Float:
         """Return the swarm's velocities before their limit."""
-        half, dimensions = state.velocity.shape[1:]
+        half = state.velocity.shape[1]
         inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
-        x, memory, r = state.x[:, :half], state.memory[:, :half], u[:, :half, : 2 * dimensions]
+        x, memory = state.x[:, :half], state.memory[:, :half]
         return velocity(x, state.velocity, memory, state.leader, r, inertia, self.social, self.cognitive)
 
-    def _change(self, x: Float, leader: Float, u: Float, curve: float) -> Float:
-        """Return what mutation and crossover add to the evolving half.
+    def _change(self, x: Float, leader: Float, picks: Int, curve: float) -> Float:
+        """Return what mutation adds to the evolving half.
 
         The paper's beta x + (1 - beta) leader is x + (1 - beta) (leader - x).
         """
-        population, dimensions = x.shape[1:]
         own = self.own_max - (self.own_max - self.own_min) * curve  # [dpso2014] eq. 9
-        picks = integers(u[..., -3:], population - 1, population - 2, dimensions)
-        n, m = partners(picks[:, :2])
-        change = gather(x, n)
-        change -= gather(x, m)
+        change = gather(x, picks[:, 0])
+        change -= gather(x, picks[:, 1])
         change *= self.weight
         pull = leader[:, None] - x
         pull *= 1.0 - own
         change += pull  # [dpso2014] eq. 8
-        change *= mutates(u[..., 2 * dimensions : -3], self.crossover, picks[:, 2])  # [dpso2014] eq. 5
         return change

@@ -152,7 +152,7 @@ class _Loop:
     def _retired(self, state: Any, k: int) -> Any:
         """Return the state without the runs that have ended after k steps."""
         checks = self._checks(state)
-        if not any(which.any() for _, which in checks):
+        if not checks or not any(which.any() for _, which in checks):
             return state
         for status, which in checks:
             for i in np.flatnonzero(which):

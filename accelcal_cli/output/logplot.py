@@ -37,19 +37,7 @@ def plot_log(found: Detection, path: str) -> None:
         axes = figure.subplots()
         edges = _spans(found)
         _log(axes, found)
-        for k, (start, end) in enumerate(edges):
-            axes.axvspan(
-                start, end, color=SHADE, alpha=0.45, linewidth=0, zorder=0, label="" if k else "static pose"
-            )
-            if (end - start) * MOST_NUMBERS > edges[-1, 1] - edges[0, 0]:
-                axes.annotate(
-                    str(k + 1),
-                    ((start + end) / 2, 1.0),
-                    xycoords=("data", "axes fraction"),
-                    ha="center",
-                    va="bottom",
-                    fontsize=6,
-                )
+        _shade(axes, edges)
         axes.set_title(
             f"{Path(found.source).name}: {len(edges)} static poses, multiplier {found.multiplier:g}",
             fontsize=11,
@@ -69,6 +57,17 @@ def _spans(found: Detection) -> Float:
     """Return first and last abscissa of each interval, shape (I, 2)."""
     poses = found.intervals
     return np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
+
+
+def _shade(axes: Axes, edges: Float) -> None:
+    """Mark the intervals, and number those that have room for it."""
+    for k, (start, end) in enumerate(edges):
+        label = "" if k else "static pose"
+        axes.axvspan(start, end, color=SHADE, alpha=0.45, linewidth=0, zorder=0, label=label)
+        if (end - start) * MOST_NUMBERS > edges[-1, 1] - edges[0, 0]:
+            place = ((start + end) / 2, 1.0)
+            at = ("data", "axes fraction")
+            axes.annotate(str(k + 1), place, xycoords=at, ha="center", va="bottom", fontsize=6)
 
 
 def _log(axes: Axes, found: Detection) -> None:

@@ -145,7 +145,7 @@ class _Lines:
         return b"".join(out)
 
     def _number(self, value: float) -> bytes:
-        text = repr(value)
+        text = repr(value) if value == value else "NaN"  # as polars writes it
         return (text.replace(".", ",") if self.dialect.decimal_comma else text).encode()
 
     def _comment(self, line: bytes) -> bytes:

@@ -44,7 +44,7 @@ class Waters:
     period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
     noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", above=0.0, high=1000.0)
     initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
-    digests: tuple[str, ...] = field(default=(), metadata={"doc": "SHA-256 of the files"})
+    digests: str = field(default="", metadata={"doc": "SHA-256 of the files"})
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -54,17 +54,17 @@ class Waters:
 
     def hashed(self) -> Waters:
         """Return the same with the hashes of its files, so that other contents are another study."""
+        if self.map not in PRESETS and not Path(self.map).suffix and not Path(self.map).exists():
+            raise ConfigError(
+                f'unknown map "{self.map}"{did_you_mean(self.map, PRESETS)}; known: {", ".join(PRESETS)}, or the path '
+                "of a file"
+            )
         files = [path for path in (self.map if self.map not in PRESETS else "", self.voyage) if path]
-        return replace(self, digests=tuple(digest(path) for path in files))
+        return replace(self, digests=" ".join(map(digest, files)))
 
     def gravity_map(self, seed: int) -> GravityMap:
         """Return the map. Raises DataError when its file cannot be used."""
         if self.map not in PRESETS:
-            if not Path(self.map).suffix and not Path(self.map).exists():
-                raise ConfigError(
-                    f'unknown map "{self.map}"{did_you_mean(self.map, PRESETS)}; known: {", ".join(PRESETS)}, '
-                    "or the path of a file"
-                )
             return load_map(self.map)
         return generate(PRESETS[self.map], seed if self.map_seed is None else self.map_seed, self.map)
 

@@ -1,0 +1,219 @@
+"""Known attitudes: from the fit of all twelve parameters to the record."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from accelcal_cli import __version__
+from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.assemble import nominal_before
+from accelcal_cli.calibration.known import Linear, fit
+from accelcal_cli.calibration.lotters import ROWS_COLUMNS
+from accelcal_cli.calibration.quality import PARAMETERS, UNDETERMINED, WEAK
+from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL
+from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.robust import pose_weights
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.poses import AXES
+from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.streams import Float
+
+NEAR_G = 0.05
+"""Largest part by which the mean length of the reference may differ from g: more is another unit."""
+
+FEWEST_POSES = 6
+
+
+def calibrate_known(readings: Readings, settings: Settings) -> Calibration:
+    """Calibrate one sensor whose attitudes are known.
+
+    Args:
+        readings: J poses with the reference specific force of each.
+        settings: g, weights; the search does not apply.
+
+    Raises:
+        DataError: no reference, or one of another unit than g.
+        ConfigError: a robust loss, which this fit does not have.
+    """
+    reference = readings.reference
+    if reference is None:
+        raise DataError(
+            f"{readings.source}: --attitudes known needs the specific force of every pose: fx, fy, fz"
+        )
+    if settings.robust != "none":
+        raise ConfigError(f"robust: {settings.robust} does not go with --attitudes known; expected none")
+    if settings.weights == "auto":
+        raise ConfigError("weights: auto does not go with --attitudes known; expected none, n or sd")
+    length = float(np.linalg.norm(reference, axis=1).mean())
+    if abs(length / settings.g - 1.0) > NEAR_G:
+        raise DataError(
+            f"{readings.source}: the reference specific force has a mean length of {length:.6g}, and g is "
+            f"{settings.g:.6g}; state the g of its unit with --g"
+        )
+    weights = pose_weights(readings, settings.weights)
+    return _assembled(
+        readings, reference, settings, weights, fit(readings.output(), reference, settings.g, weights)
+    )
+
+
+def _assembled(
+    readings: Readings, reference: Float, settings: Settings, weights: Float | None, found: Linear
+) -> Calibration:
+    if found.rank < 4:
+        raise DataError(
+            f"{readings.source}: the known attitudes span {found.rank} of 4 dimensions; turn the sensor to at least "
+            f"four attitudes that do not lie in one plane, better {FEWEST_POSES} or more"
+        )
+    g, model = settings.g, found.model
+    dop = np.sqrt(np.diagonal(found.cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
+    nine = _nine(model)
+    cofactor = nine @ np.kron(np.eye(3), found.cofactor) @ nine.T
+    size = np.sqrt(np.diagonal(model.K @ model.K.T))  # one unit of force along each sensor axis
+    sigma_K = found.s * np.outer(size, dop[:3]) / g
+    low = model.in_gauge("lower")
+    force = low.specific_force(readings.output())
+    directions = force / np.linalg.norm(force, axis=1, keepdims=True)
+    rows = quality.design(directions)
+    modulus = np.linalg.norm(force, axis=1) - np.linalg.norm(reference, axis=1)
+    before, before_model = nominal_before(float(np.diagonal(model.K).mean()), model.D, settings)
+    raw = np.linalg.norm(before_model.specific_force(readings.output()), axis=1) - g
+    square = np.einsum("ji,ji->j", force, force)
+    cost = float(np.sum((g * g - square) ** 2))
+    w = np.ones(len(force)) if weights is None else weights
+    named = _outliers(found, w)
+    fits = _pose_fits(readings, found, w, np.column_stack([modulus, raw, directions]))
+    return Calibration(
+        K_a=model.K,
+        D_a=model.D,
+        K_A=model.K_A,
+        f_0=model.f_0,
+        gauge="full",
+        sigma=Sigma(sigma_K, found.s * size * dop[3]),
+        dop=_dop(np.sqrt(np.diagonal(cofactor))),
+        verdict=_verdict(dop, found.freedom),
+        reasons=_reasons(dop, found.freedom),
+        suggestions=(),
+        cost_search=cost,
+        cost=cost,
+        rms=float(np.sqrt(np.mean(modulus**2))),
+        rms_before=float(np.sqrt(np.mean(raw**2))),
+        before=before,
+        s=found.s,
+        freedom=found.freedom,
+        noise_ratio=None,
+        noise_chance=None,
+        covariance=found.s**2 * cofactor,
+        information=rows.T @ rows,
+        nominal_scale=np.diagonal(before_model.K).copy(),
+        nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
+        poses=readings.poses,
+        evaluations=1,
+        runs=1,
+        runs_agreeing=1,
+        poses_fit=fits,
+        outliers=named,
+        convergence=(),
+        optimizer="linear least squares",
+        settings={**asdict(settings), "version": __version__},
+        g=g,
+        data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
+        notes=(*readings.notes, *_notes(readings)),
+        version=__version__,
+    )
+
+
+def _notes(readings: Readings) -> tuple[str, ...]:
+    known = "The attitudes are known: all twelve parameters are determined; the search does not apply."
+    if readings.temperature is None:
+        return (known,)
+    return (known, "Temperature column not used: with known attitudes the slopes are not fitted.")
+
+
+def _nine(model: ErrorModel) -> Float:
+    """Return d (nine parameters of gauge `lower`) / d Y, shape (9, 12).
+
+    [dK_a dD_a] = K_a Y with Y in units of force (its first three columns at 1 g), rows running slowest. So
+    E = -Y / g in the body frame, R E R^T in that of gauge `lower`, and of it the rotation is no change of the sensor.
+    """
+    low = model.in_gauge("lower").K
+    R = np.linalg.solve(low, model.K)
+    columns = []
+    for p in range(12):
+        Y = np.zeros((3, 4))
+        Y.flat[p] = 1.0
+        E = R @ (-Y[:, :3]) @ R.T
+        both = E + E.T
+        column = [both[i, j] * (0.5 if i == j else 1.0) for i, j in ROWS_COLUMNS[:6]]
+        columns.append([*column, *(model.K @ Y[:, 3] / np.diagonal(low))])
+    return np.array(columns).T
+
+
+def _dop(dop: Float) -> Dop:
+    kinds = (quality.MISALIGNMENT, quality.SCALE, quality.BIAS)
+    misalignment, scale, bias = (float(dop[kind].max()) for kind in kinds)
+    return Dop(misalignment, scale, bias, float(dop.max()), dict(zip(PARAMETERS, dop.tolist(), strict=True)))
+
+
+def _verdict(dop: Float, freedom: int) -> str:
+    if dop.max() > UNDETERMINED:
+        return "undetermined"
+    return "weak" if dop.max() > WEAK or freedom < 1 else "good"
+
+
+def _reasons(dop: Float, freedom: int) -> tuple[str, ...]:
+    names = (*(f"column {axis} of K_a" for axis in AXES), "bias")
+    lines = []
+    for limit, words in ((UNDETERMINED, "The known attitudes do not determine"), (WEAK, "Weakly determined")):
+        poor = [name for name, value in zip(names, dop, strict=True) if value > limit]
+        if poor:
+            lines.append(f"{words}: {', '.join(poor)}.")
+            break
+    if freedom < 1:
+        lines.append(f"Four poses fit exactly and say nothing of their noise. Take at least {FEWEST_POSES}.")
+    return tuple(lines)
+
+
+def _square(found: Linear, w: Float) -> Float:
+    """Return the squared residual of all three axes over what the fit leaves of it, (m/s^2)^2, shape (J,)."""
+    room = np.where(found.leverage < 1.0 - 1e-9, 1.0 - found.leverage, np.nan)
+    square: Float = w * np.einsum("ji,ji->j", found.error, found.error) / room
+    return square
+
+
+def _outliers(found: Linear, w: Float) -> tuple[int, ...]:
+    """Return the poses whose three residuals are beyond chance (F test, Bonferroni)."""
+    if found.freedom <= 3:
+        return ()
+    from scipy.special import fdtrc
+
+    square, freedom = _square(found, w), found.freedom - 3
+    others = (found.s**2 * found.freedom - square) / freedom
+    chance = fdtrc(3, freedom, square / 3.0 / np.where(others > 0, others, np.nan)) * len(square)
+    return tuple(int(j) for j in np.flatnonzero(chance < OUTLIER_LEVEL))
+
+
+def _pose_fits(readings: Readings, found: Linear, w: Float, seen: Float) -> tuple[PoseFit, ...]:
+    """Return the fit pose by pose; `seen` is |f| - |reference|, |f| - g before, and the direction, shape (J, 5)."""
+    room = np.where(found.leverage < 1.0 - 1e-9, 1.0 - found.leverage, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        studentised = np.sqrt(w) * seen[:, 0] / (found.s * np.sqrt(room))
+    kept = np.arange(len(w))
+    if len(w) > KEPT:
+        kept = np.sort(np.argsort(-np.nan_to_num(_square(found, w)))[:KEPT_WORST])
+    return tuple(
+        PoseFit(
+            int(j),
+            readings.where(int(j)),
+            float(seen[j, 0]),
+            float(studentised[j]),
+            float(found.leverage[j]),
+            float(seen[j, 0] / room[j]),
+            float(seen[j, 1]),
+            (float(seen[j, 2]), float(seen[j, 3]), float(seen[j, 4])),
+        )
+        for j in kept
+    )

@@ -1,0 +1,126 @@
+"""Known attitudes: twelve parameters by linear least squares."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from simulated import MEMS, noise
+
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.model import to_gauge
+from accelcal_cli.sensor.readings import Readings
+
+G, SIGMA = 9.8, 2e-3
+KNOWN = Settings(g=G, attitudes="known")
+TWELVE = poses.faces_edges()
+
+
+def known(u=TWELVE, sigma=SIGMA, seed=1, g=G, **more):
+    return Readings.from_array(MEMS.output(g * u + noise(len(u), sigma, seed)), reference=g * u, **more)
+
+
+def test_all_twelve_parameters_are_found():
+    result = calibrate(known(sigma=0.0), KNOWN)
+    np.testing.assert_allclose(result.K_a, MEMS.K, atol=1e-13)
+    np.testing.assert_allclose(result.D_a, MEMS.D, atol=1e-13)
+    assert result.gauge == "full"
+    assert result.verdict == "good"
+
+
+def test_sigma_is_what_repeated_noise_gives():
+    runs = [calibrate(known(seed=k), KNOWN) for k in range(300)]
+    K, D = np.array([r.K_a for r in runs]), np.array([r.D_a for r in runs])
+    sigma = runs[0].sigma
+    assert np.isfinite(sigma.K_a).all()
+    s = np.mean([r.s**2 for r in runs]) ** 0.5
+    assert s == pytest.approx(SIGMA, rel=0.05)
+    factor = s / runs[0].s
+    np.testing.assert_allclose(K.std(axis=0), sigma.K_a * factor, rtol=0.15)
+    np.testing.assert_allclose(D.std(axis=0), sigma.D_a * factor, rtol=0.15)
+    assert runs[0].freedom == 3 * 12 - 12
+
+
+def test_the_covariance_of_the_nine_is_what_repeated_noise_gives():
+    """In gauge lower: differences of K_A relative to the truth, as force."""
+    low = to_gauge(MEMS.K, "lower")
+    runs = [calibrate(known(seed=k), KNOWN) for k in range(300)]
+    values = []
+    for r in runs:
+        E = np.linalg.solve(to_gauge(r.K_a, "lower"), low) - np.eye(3)
+        values.append(
+            [*(G * E[[0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1]]), *((r.D_a - MEMS.D) / np.diagonal(low))]
+        )
+    expected = np.sqrt(np.mean([np.diagonal(r.covariance) for r in runs], axis=0))
+    np.testing.assert_allclose(np.std(values, axis=0), expected, rtol=0.15)
+
+
+def test_the_record_goes_round():
+    result = calibrate(known(), KNOWN)
+    assert Calibration.from_record(result.record(), "r").record() == result.record()
+    assert result.settings["attitudes"] == "known"
+    assert any("attitudes are known" in note for note in result.notes)
+
+
+def test_a_wrong_attitude_is_named():
+    u = poses.turns()
+    reference = G * u
+    reference[7] = (
+        G * np.array([0.0, np.sin(0.02), np.cos(0.02)]) if abs(u[7, 2]) > 0.9 else reference[7][[1, 2, 0]]
+    )
+    data = Readings.from_array(MEMS.output(G * u + noise(24, SIGMA, 1)), reference=reference)
+    assert 7 in calibrate(data, KNOWN).outliers
+
+
+def test_weights_count():
+    count = np.array([1.0] * 6 + [100.0] * 6)
+    plain = calibrate(known(count=count), KNOWN)
+    heavy = calibrate(known(count=count), dataclasses.replace(KNOWN, weights="n"))
+    assert np.abs(plain.K_a - heavy.K_a).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("u", "verdict"), [(poses.faces(), "good"), (np.eye(3)[[0, 1, 2, 0]] * [[1], [1], [1], [-1]], "weak")]
+)
+def test_verdicts(u, verdict):
+    result = calibrate(known(u), KNOWN)
+    assert result.verdict == verdict
+    assert bool(result.reasons) == (verdict == "weak")
+
+
+def test_attitudes_near_one_another_do_not_determine():
+    u = np.array([0.0, 0.0, 1.0]) + 0.01 * poses.fibonacci(12)
+    result = calibrate(known(u / np.linalg.norm(u, axis=1, keepdims=True)), KNOWN)
+    assert result.verdict == "undetermined"
+    assert "do not determine" in result.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("data", "settings", "message"),
+    [
+        (Readings.from_array(poses.turns()), KNOWN, "fx, fy, fz"),
+        (known(), dataclasses.replace(KNOWN, g=1.0), "mean length of 9.8"),
+        (known(poses.turns()[:8:4]), KNOWN, "2 of 4 dimensions"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(data, settings, message):
+    with pytest.raises(DataError, match=message):
+        calibrate(data, settings)
+
+
+@pytest.mark.parametrize("changes", [{"robust": "huber"}, {"weights": "auto"}])
+def test_settings_that_do_not_apply_are_refused(changes):
+    with pytest.raises(ConfigError, match="does not go with --attitudes known"):
+        calibrate(known(), dataclasses.replace(KNOWN, **changes))
+
+
+def test_a_reference_is_not_used_unasked():
+    """It may be what accelcal apply wrote."""
+    result = calibrate(known(poses.turns()), Settings(g=G, optimizer="levenberg-marquardt"))
+    assert result.gauge == "lower"
+    assert any("--attitudes known" in note for note in result.notes)

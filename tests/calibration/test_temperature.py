@@ -1,0 +1,107 @@
+"""Scale factors and biases linear in temperature."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from simulated import MEMS, noise
+
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.temperature import _linearised
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.readings import Readings
+
+G, SIGMA = 9.8, 2e-3
+SETTINGS = Settings(optimizer="levenberg-marquardt", g=G)
+U = np.concatenate([poses.turns(), poses.fibonacci(24)])
+DEGREES = np.repeat([10.0, 40.0], 24)
+LOWER = MEMS.in_gauge("lower")
+SCALE, BIAS = np.array([1e-4, -5e-5, 2e-4]), np.array([3e-3, -2e-3, 1e-3])
+
+
+def warm(seed=1, sigma=SIGMA, degrees=DEGREES, u=U, **more):
+    t = (degrees - 25.0)[:, None]
+    output = (1 + SCALE * t) * ((G * u + noise(len(u), sigma, seed)) @ LOWER.K.T) + LOWER.D + BIAS * t
+    return Readings.from_array(output, temperature=degrees, **more)
+
+
+def test_slopes_are_found_and_the_others_hold_at_the_mean_temperature():
+    result = calibrate(warm(sigma=0.0), SETTINGS)
+    slopes = result.temperature
+    assert slopes.reference == 25.0
+    assert (slopes.low, slopes.high) == (10.0, 40.0)
+    np.testing.assert_allclose(slopes.scale, SCALE, rtol=1e-8)
+    np.testing.assert_allclose(slopes.bias, BIAS, rtol=1e-8)
+    np.testing.assert_allclose(result.K_a, LOWER.K, atol=1e-10)
+    np.testing.assert_allclose(result.D_a, LOWER.D, atol=1e-10)
+    assert result.freedom == 48 - 15
+    assert any("linear in temperature" in note for note in result.notes)
+
+
+def test_sigmas_are_what_repeated_noise_gives():
+    runs = [calibrate(warm(seed=k), SETTINGS) for k in range(150)]
+    first = runs[0]
+    factor = np.sqrt(np.mean([r.s**2 for r in runs])) / first.s
+    for value, sigma in (("scale", "sigma_scale"), ("bias", "sigma_bias")):
+        spread = np.std([getattr(r.temperature, value) for r in runs], axis=0)
+        np.testing.assert_allclose(spread, getattr(first.temperature, sigma) * factor, rtol=0.2)
+    np.testing.assert_allclose(np.std([r.D_a for r in runs], axis=0), first.sigma.D_a * factor, rtol=0.2)
+    assert factor * first.s == pytest.approx(SIGMA, rel=0.05)
+
+
+def test_the_jacobian_is_the_derivative():
+    N, t, p = warm().output(), (DEGREES - 25.0) / 15.0, np.zeros(15)
+    _, J = _linearised(N, t, LOWER, p, G)
+    for k in range(15):
+        step = 1e-6 * np.eye(15)[k]
+        ends = [_linearised(N, t, LOWER, p + side * step, G)[0] for side in (1, -1)]
+        np.testing.assert_allclose(J[:, k], (ends[0] - ends[1]) / 2e-6, atol=1e-6)
+
+
+def test_the_record_goes_round():
+    result = calibrate(warm(), SETTINGS)
+    record = json.loads(json.dumps(result.record()))
+    again = Calibration.from_record(record, "r")
+    assert again.record() == result.record()
+    np.testing.assert_array_equal(again.temperature.bias, result.temperature.bias)
+    record["temperature"]["scale"] = [1, 2]
+    with pytest.raises(DataError, match="temperature: expected 3 numbers"):
+        Calibration.from_record(record, "r")
+    del record["temperature"]["scale"]
+    with pytest.raises(DataError, match="temperature: 'scale' is missing"):
+        Calibration.from_record(record, "r")
+
+
+def test_a_record_without_the_block_is_a_plain_one():
+    record = calibrate(warm(), dataclasses.replace(SETTINGS, temperature=False)).record()
+    assert record.pop("temperature") is None
+    assert Calibration.from_record(record, "r").temperature is None
+
+
+def _gap():
+    degrees = DEGREES.copy()
+    degrees[3] = np.nan
+    return degrees
+
+
+@pytest.mark.parametrize(
+    ("data", "settings", "words"),
+    [
+        (lambda: warm(degrees=np.linspace(20, 21, 48)), {}, "differ by 1 degrees"),
+        (lambda: Readings.from_array(warm().output(), temperature=_gap()), {}, "missing in 1 poses"),
+        (lambda: warm(degrees=DEGREES[12:36:2], u=U[12:36:2]), {}, "12 poses are too few"),
+        # every attitude at one temperature of its own: cold faces, warm corners
+        (lambda: warm(degrees=np.r_[[10.0], np.full(47, 40.0)]), {}, "do not determine slopes"),
+        (lambda: warm(), {"robust": "huber"}, "least squares only"),
+    ],
+)
+def test_where_the_data_do_not_determine_slopes_the_model_is_plain(data, settings, words):
+    result = calibrate(data(), dataclasses.replace(SETTINGS, **settings))
+    assert result.temperature is None
+    assert any("Temperature column not used" in note and words in note for note in result.notes)

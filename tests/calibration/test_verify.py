@@ -1,0 +1,176 @@
+"""An old result against new readings."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from simulated import MEMS, noise, readings, rotation
+
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.quality import PARAMETERS, design
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.verify import verify
+from accelcal_cli.calibration.verify_tables import tables
+from accelcal_cli.errors import DataError
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.readings import Readings
+
+G, SIGMA = 9.8, 2e-3
+FAST = Settings(optimizer="levenberg-marquardt", g=G)
+LOWER = MEMS.in_gauge("lower")
+TURNS = poses.turns()
+
+
+def result(u=TURNS, seed=1, **settings):
+    return calibrate(readings(u, model=MEMS, sigma=SIGMA, seed=seed), dataclasses.replace(FAST, **settings))
+
+
+def new(u=TURNS, model=MEMS, sigma=SIGMA, seed=2):
+    return readings(u, model=model, sigma=sigma, seed=seed)
+
+
+def moved(scale=(0, 0, 0), bias=(0, 0, 0)):
+    """The sensor with other scale factors (parts) and biases (m/s^2)."""
+    K = np.diag(1.0 + np.array(scale)) @ LOWER.K
+    return ErrorModel(K, LOWER.D + np.array(bias) * np.diagonal(LOWER.K))
+
+
+def sigma_of_difference(u, v):
+    """One-sigma of the nine differences, m/s^2, from two sets of poses."""
+    return SIGMA * np.sqrt(sum(np.diagonal(np.linalg.inv(design(w).T @ design(w))) for w in (u, v)))
+
+
+@pytest.mark.parametrize("count", [12, 24])
+def test_unchanged_sensors_seldom_fail(count):
+    """From readings to verdict; 150 sensors at 5 % give 7.5 with a scatter of 2.7."""
+    u = poses.directions(count, None, np.zeros((0, 3)))
+    hits = sum(verify(result(u, 2 * k), new(u, seed=2 * k + 1)).verdict == "changed" for k in range(150))
+    assert 1 <= hits <= 16
+
+
+def test_a_bias_shift_of_five_sigma_is_caught():
+    """150 sensors; 95 % of them are 142, with a scatter of 2.7."""
+    u = poses.turns()
+    shift = 5 * sigma_of_difference(u, u)[8]
+    shifted = moved(bias=(0, 0, shift))
+    hits = sum(
+        verify(result(u, 2 * k), new(u, shifted, seed=2 * k + 1)).verdict == "changed" for k in range(150)
+    )
+    assert hits >= 138
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "value"),
+    [
+        ({"bias": (0, 0.02, 0)}, "bias y", 0.02),
+        ({"scale": (0, 0, 0.004)}, "scale factor z", -0.004 * G),
+    ],
+)
+def test_what_changed_is_named_and_measured(change, name, value):
+    found = verify(result(), new(model=moved(**change)))
+    assert found.verdict == "changed"
+    assert not found.passed
+    assert f"Changed: {name}." in found.reasons
+    (named,) = [d for d in found.differences if d.changed]
+    assert named.name == name
+    assert named.value == pytest.approx(value, abs=5 * named.sigma)
+    assert named.sigma == pytest.approx(
+        sigma_of_difference(poses.turns(), poses.turns())[PARAMETERS.index(name)], rel=0.5
+    )
+
+
+def test_the_body_frame_and_the_gauge_do_not_matter():
+    """A sensor that is mounted otherwise, and a result in another gauge: the same sensor."""
+    turned = ErrorModel(MEMS.K @ rotation(4), MEMS.D)
+    plain = verify(result(), new(model=turned))
+    assert plain.verdict == "unchanged"
+    other = verify(result(gauge="symmetric"), new(model=turned))
+    assert other.chance == pytest.approx(plain.chance, rel=1e-6)
+    assert other.chi_square == pytest.approx(plain.chi_square, rel=1e-6)
+
+
+def test_six_faces_tell_of_scale_and_bias():
+    same = verify(result(), new(poses.faces()))
+    assert same.verdict == "unchanged"
+    assert same.directions == 6
+    assert [d.name for d in same.differences if np.isnan(d.value)] == list(PARAMETERS[3:6])
+    assert any("6 of 9 directions" in line for line in same.reasons)
+    assert any("nothing of their noise" in line for line in same.reasons)
+    changed = verify(result(), new(np.repeat(poses.faces(), 4, axis=0), moved(bias=(0.03, 0, 0))))
+    assert changed.verdict == "changed"
+    assert any(line == "Changed: bias x." for line in changed.reasons)
+    assert changed.freedom == 18
+
+
+def test_two_poses_are_something():
+    u = poses.faces()[:2]
+    assert verify(result(), new(u)).verdict == "unchanged"
+    assert verify(result(), new(u, moved(bias=(0.05, 0, 0)))).verdict == "changed"
+
+
+def test_more_noise_is_said_but_is_no_change():
+    found = verify(result(), new(sigma=5 * SIGMA))
+    assert found.noise_chance < 0.01
+    assert any("times the noise of the old" in line for line in found.reasons)
+    assert found.s_new == pytest.approx(5 * SIGMA, rel=0.5)
+
+
+def test_readings_without_noise_are_no_change():
+    clean = calibrate(readings(poses.turns(), model=MEMS, sigma=0.0), FAST)
+    assert verify(clean, new(sigma=0.0)).verdict == "unchanged"
+    assert verify(clean, new(model=moved(bias=(1e-4, 0, 0)), sigma=0.0)).verdict == "changed"
+
+
+def test_the_tolerance_is_on_the_rms_under_the_old_result():
+    old = result()
+    f = old.model.specific_force(new().output())
+    rms = np.sqrt(np.mean((np.linalg.norm(f, axis=1) - G) ** 2))
+    found = verify(old, new(), tolerance=2 * rms)
+    assert found.rms == pytest.approx(rms, rel=1e-9)
+    assert found.passed
+    assert not verify(old, new(), tolerance=0.5 * rms).passed
+
+
+def test_a_large_change_is_no_trouble():
+    found = verify(result(), new(model=moved(scale=(0.1, 0, 0), bias=(0, 2, 0))))
+    assert found.verdict == "changed"
+    assert found.differences[7].value == pytest.approx(2.0, rel=1e-2)
+
+
+@pytest.mark.parametrize("u", [poses.faces(), poses.fibonacci(9)], ids=["undetermined", "no freedom"])
+def test_a_result_without_uncertainty_is_refused(u):
+    with pytest.raises(DataError, match=r"no (uncertainty|noise)"):
+        verify(result(u), new())
+
+
+def test_the_record_is_plain_and_the_tables_hold_it():
+    found = verify(result(), new(poses.faces()), tolerance=0.01)
+    record = json.loads(json.dumps(found.record(), allow_nan=False))
+    assert record["schema"] == "accelcal/verification/1"
+    assert record["differences"][3]["value"] is None
+    assert record["result"]["sha256"] != record["data"]["sha256"]
+    differences, tests = tables(found)
+    assert len(differences.rows) == 9
+    assert ("tolerance", "0.01", "m/s^2") in tests.rows
+
+
+def test_temperatures_are_brought_to_that_of_the_result():
+    u = np.concatenate([poses.turns(), poses.turns()])
+    degrees = np.repeat([10.0, 40.0], 24)
+    slopes = 2e-3 * (degrees - 25.0)[:, None] * [1.0, -1.0, 0.5]
+
+    def warm(seed):
+        output = MEMS.output(G * u + noise(48, SIGMA, seed)) + slopes
+        return Readings.from_array(output, temperature=degrees)
+
+    old = calibrate(warm(1), FAST)
+    assert old.temperature is not None
+    assert verify(old, warm(2)).verdict == "unchanged"
+    cold = Readings.from_array(warm(3).output()[:24])
+    found = verify(old, cold)
+    assert found.verdict == "changed"
+    assert any("no temperatures" in line for line in found.reasons)

@@ -1,0 +1,201 @@
+"""Every filter on a short voyage: it beats the INS, not the bound, and says how good it is."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from accelcal_cli.navigation.apo_pf import forces, masses
+from accelcal_cli.navigation.bound import bound
+from accelcal_cli.navigation.differential import metropolis
+from accelcal_cli.navigation.error_model import Grade
+from accelcal_cli.navigation.field import PRESETS, generate
+from accelcal_cli.navigation.filters import FILTER_PURPOSE, FILTERS
+from accelcal_cli.navigation.resampling import SCHEMES, effective_size, normalised
+from accelcal_cli.navigation.scenario import simulate
+from accelcal_cli.navigation.scores import counted, score
+from accelcal_cli.navigation.voyage import Plan
+from accelcal_cli.streams import Streams
+
+NAMES = ["apo-pf", "de-pf", "pf", "pso-pf", "reference"]
+
+
+def run(scenario, name, seed=1, runs=range(6), **settings):
+    with np.errstate(all="ignore"):
+        track = FILTERS.build(name, settings, "test").run(scenario, Streams(seed, runs, FILTER_PURPOSE))
+        return track, score(scenario, track)
+
+
+def rmse(scores) -> float:
+    return float(np.sqrt((scores.north + scores.east).mean()))
+
+
+def test_these_are_all():
+    assert FILTERS.names() == NAMES
+
+
+# Resampling
+
+
+weights = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=30).filter(lambda w: sum(w) > 1e-6)
+
+
+@given(weights, st.floats(0.0, 0.999))
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_every_particle_is_copied_as_often_as_it_should_be(scheme, w, u):
+    w = np.array([w]) / sum(w)
+    chosen = SCHEMES[scheme](w, np.array([u]))
+    copies = np.bincount(chosen[0], minlength=w.shape[1])
+    assert copies.sum() == w.shape[1]
+    assert (np.abs(copies - w.shape[1] * w[0]) < 1 + 1e-6).all()
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_resampling_is_unbiased(scheme):
+    w = normalised(np.random.default_rng(0).normal(size=(1, 9)) * 2)
+    u = (np.arange(4000) + 0.5) / 4000
+    chosen = SCHEMES[scheme](np.repeat(w, 4000, axis=0), u)
+    copies = np.stack([(chosen == i).sum(axis=1) for i in range(9)]).mean(axis=1)
+    np.testing.assert_allclose(copies, 9 * w[0], atol=0.01)
+
+
+@given(st.lists(st.floats(-1e6, 0.0), min_size=2, max_size=30))
+def test_weights_sum_to_one_however_small_they_are(logs):
+    w = normalised(np.array([logs]) - 1e6)
+    assert w.sum() == pytest.approx(1.0)
+    assert 1.0 - 1e-9 <= effective_size(w)[0] <= w.shape[1] + 1e-9
+
+
+# Operators
+
+
+def test_the_forces_are_the_double_sum():
+    rng = np.random.default_rng(3)
+    x, f = rng.normal(size=(2, 12, 2)), rng.normal(size=(2, 12))
+    m = masses(f)
+    expected = np.zeros_like(x)
+    for r in range(2):
+        for i in range(12):
+            for j in range(12):
+                if f[r, i] < f[r].max():
+                    sign = np.sign(f[r, j] - f[r, i])
+                    expected[r, i] += sign * m[r, j] * (x[r, j] - x[r, i]) / m[r].sum()
+    np.testing.assert_allclose(forces(x, f), expected, atol=1e-12)
+
+
+def test_de_mc_leaves_a_gaussian_as_it_is():
+    streams = Streams(0, [0], 99)
+    x = streams.normal(400, 2)
+
+    def rate(v):
+        return -0.5 * np.square(v).sum(axis=2)
+
+    level, total = rate(x), []
+    for _ in range(60):
+        x, level = metropolis(x, level, rate, streams)
+        total.append(x[0])
+    pool = np.concatenate(total[10:])
+    np.testing.assert_allclose(np.cov(pool.T), np.eye(2), atol=0.15)
+    np.testing.assert_allclose(level, rate(x))
+
+
+# Filters
+
+
+@pytest.fixture(scope="module")
+def results(voyage):
+    return {
+        name: run(voyage, name, generations=3) if name not in ("pf", "reference") else run(voyage, name)
+        for name in NAMES
+    }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_filter_beats_the_ins_and_not_the_bound(results, voyage, name):
+    _, scores = results[name]
+    late = counted(voyage)
+    least = np.sqrt(bound(voyage)[late].sum(axis=1).mean())
+    alone = np.sqrt(scores.ins.mean())
+    assert 0.8 * least < rmse(scores) < 0.5 * alone
+
+
+def test_the_order_that_is_told(results):
+    found = {name: rmse(scores) for name, (_, scores) in results.items()}
+    assert found["reference"] < 0.7 * found["pf"]
+    assert found["de-pf"] < 0.8 * found["pf"]
+
+
+@pytest.mark.parametrize("name", ["pf", "de-pf", "reference"])
+def test_the_claimed_spread_fits_the_error(results, name):
+    assert 0.7 < results[name][1].nees.mean() < 6.0
+    assert not results[name][1].lost.any()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_plain_filter_is_far_better_than_the_ins(seed):
+    scenario = simulate(
+        generate(PRESETS["rough"], seed), Plan(), Grade(), runs=range(6), seed=seed, period=10.0
+    )
+    _, scores = run(scenario, "pf", seed=seed)
+    assert rmse(scores) < 600
+    assert rmse(scores) < 0.25 * np.sqrt(scores.ins.mean())
+
+
+def test_without_evolution_the_marginal_filter_loses_lock(voyage):
+    _, scores = run(voyage, "de-pf", generations=0)
+    assert rmse(scores) > 1000
+
+
+def test_without_measurements_every_filter_drifts(voyage):
+    deaf = dataclasses.replace(voyage, measured=np.full_like(voyage.measured, np.nan))
+    for name in ("pf", "de-pf", "reference"):
+        _, scores = run(deaf, name, **({"generations": 2} if name == "de-pf" else {}))
+        assert rmse(scores) > 1500, name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_alone_is_the_same_as_in_a_batch(voyage, rough, name):
+    settings = {} if name in ("pf", "reference") else {"generations": 2}
+    plan = Plan(hours=2.5)
+    batch = simulate(rough, plan, Grade(), runs=range(4), seed=1)
+    alone = simulate(rough, plan, Grade(), runs=range(2, 3), seed=1)
+    assert (alone.measured[0] == batch.measured[2]).all()
+    together, _ = run(batch, name, runs=range(4), **settings)
+    single, _ = run(alone, name, runs=range(2, 3), **settings)
+    assert (together.mean[2] == single.mean[0]).all()
+    assert (together.covariance[2] == single.covariance[0]).all()
+
+
+@pytest.mark.parametrize("name", ["de-pf", "pso-pf", "apo-pf"])
+def test_the_literal_mode_is_told_to_lose_lock(rough, name):
+    scenario = simulate(rough, Plan(), Grade(), runs=range(3), seed=1, period=60.0)
+    _, scores = run(scenario, name, runs=range(3), mode="literal", generations=10)
+    assert scores.lost.mean() > 0.5
+
+
+@pytest.mark.parametrize("road", ["metropolis", "window", "safe"])
+def test_the_other_roads_run(rough, road):
+    scenario = simulate(rough, Plan(hours=2.5), Grade(), runs=range(3), seed=1)
+    track, _ = run(scenario, "de-pf", runs=range(3), road=road, generations=2)
+    assert np.isfinite(track.mean).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_constant_map_leaves_the_cloud_wide(name):
+    flat = simulate(
+        generate(PRESETS["constant"], 0), Plan(hours=3.5), Grade(), runs=range(3), seed=1, period=30.0
+    )
+    settings = {} if name in ("pf", "reference") else {"generations": 3}
+    track, _ = run(flat, name, runs=range(3), **settings)
+    claimed = np.sqrt(np.einsum("rkii->rk", track.covariance))[:, -1]
+    assert (claimed > 800).all()
+
+
+def test_residual_resampling_and_twelve_states_run(rough):
+    scenario = simulate(rough, Plan(hours=2.5), Grade(), runs=range(3), seed=1)
+    track, _ = run(scenario, "pf", runs=range(3), resampling="residual", state=12)
+    assert np.isfinite(track.mean).all()

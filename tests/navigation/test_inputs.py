@@ -1,0 +1,254 @@
+"""Maps and voyages from files, and `accelcal navigate` on good and on bad ones."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import accelcal_cli
+from accelcal_cli.errors import AccelcalError, DataError
+from accelcal_cli.navigation.field import Field, generate
+from accelcal_cli.navigation.map_files import load_map
+from accelcal_cli.navigation.voyage_file import read_voyage
+
+ROOT = Path(accelcal_cli.__file__).parents[1]
+SMALL = Field(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0)
+QUICK = """
+plan: {hours: 2.6, turn: 0, speed: 8}
+period: 30
+"""
+
+
+def write_xyz(path, grid, skip=()):
+    rows, columns = grid.values.shape
+    south, west = np.degrees(grid.south), np.degrees(grid.west)
+    step = np.degrees(grid.step_north)
+    lines = ["longitude latitude anomaly"]
+    for i in range(rows):
+        for j in range(columns):
+            value = "nan" if (i, j) in skip else f"{grid.values[i, j]:.6f}"
+            lines.append(f"{west + j * step:.9f} {south + i * step:.9f} {value}")
+    path.write_text("\n".join(lines))
+    return path
+
+
+def navigate(*arguments, code=0):
+    done = subprocess.run(
+        [sys.executable, "-m", "accelcal_cli", "navigate", *map(str, arguments)],
+        capture_output=True, text=True, cwd=ROOT, stdin=subprocess.DEVNULL, check=False,
+    )  # fmt: skip
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    if code == 2:
+        assert len(done.stderr.strip().splitlines()) == 1
+    return done.stdout if code == 0 else done.stderr
+
+
+@pytest.fixture
+def quick(tmp_path):
+    path = tmp_path / "quick.yaml"
+    path.write_text(QUICK)
+    return path
+
+
+def test_xyz_text_is_read_back(tmp_path):
+    grid = generate(SMALL, 0)
+    read = load_map(str(write_xyz(tmp_path / "map.xyz", grid)))
+    np.testing.assert_allclose(read.values, grid.values, atol=1e-6)
+    assert read.south == pytest.approx(grid.south, abs=1e-9)
+    assert read.step_east == pytest.approx(grid.step_east, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "no rows"),
+        ("1 2 3\n1 2\n", "line 2"),
+        ("1 2 3\n1 x 3\n", "line 2"),
+        ("0 0 1\n1 1 2\n2 2 3\n3 3 4\n4 4 5\n5 5 6\n6 6 1\n", "not the nodes of a grid"),
+        ("0 0 1\n0 1 1\n1 0 1\n1 1 1\n3 0 1\n3 1 1\n", "not evenly spaced"),
+        ("0 0 1\n1 0 1\n", "two nodes in latitude"),
+        ("0 0 1\n0 5000 1\n1 0 1\n1 5000 1\n", "degrees"),
+    ],
+)
+def test_a_bad_map_is_refused(tmp_path, text, told):
+    path = tmp_path / "map.txt"
+    path.write_text(text)
+    with pytest.raises(DataError, match=told):
+        load_map(str(path))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("xarray") is None, reason="needs the extra maps")
+def test_netcdf_is_read(tmp_path):
+    import xarray
+
+    grid = generate(SMALL, 0)
+    rows, columns = grid.values.shape
+    latitude = np.degrees(grid.south) + np.arange(rows) / 60
+    longitude = np.degrees(grid.west) + np.arange(columns) / 60
+    data = xarray.DataArray(
+        grid.values[::-1], coords={"lat": latitude[::-1], "lon": longitude}, dims=("lat", "lon")
+    )
+    data.to_dataset(name="anomaly").to_netcdf(tmp_path / "map.nc")
+    np.testing.assert_allclose(load_map(str(tmp_path / "map.nc")).values, grid.values, atol=1e-9)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("xarray") is not None, reason="the extra maps is installed")
+def test_netcdf_without_xarray_says_what_to_install(tmp_path):
+    (tmp_path / "map.nc").write_bytes(b"CDF")
+    with pytest.raises(DataError, match="accelcal\\[maps\\]"):
+        load_map(str(tmp_path / "map.nc"))
+
+
+def voyage_rows(rows=240, period=30.0, gravity=True):
+    seconds = 7200 + period * np.arange(rows)
+    longitude = 115.3 + 8.0 * (seconds - 7200) / 104e3
+    lines = ["time,latitude,longitude,true_latitude,true_longitude" + (",gravity" if gravity else "")]
+    for t, e in zip(seconds, longitude, strict=True):
+        lines.append(f"{t},20.31,{e + 0.004:.8f},20.30,{e:.8f}" + (",3.5" if gravity else ""))
+    return lines
+
+
+def test_a_recorded_voyage_with_a_gap_is_refused(tmp_path):
+    lines = voyage_rows()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines[:50] + lines[60:]))
+    with pytest.raises(DataError, match="line 51: a gap of 330 s"):
+        read_voyage(str(path), 30.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda s: s.replace("latitude", "latitud", 1), 'no column "latitude" \\(did you mean "latitud"'),
+        (lambda s: s.replace("20.31", "north", 1), 'line 2, column "latitude"'),
+        (lambda s: s.replace(",3.5", ",3.5,9", 1), "line 2: expected 6 cells"),
+        (lambda s: s.split("\n")[0], "no rows"),
+    ],
+)
+def test_a_bad_voyage_is_refused(tmp_path, change, told):
+    path = tmp_path / "log.csv"
+    path.write_text(change("\n".join(voyage_rows())))
+    with pytest.raises(AccelcalError, match=told):
+        read_voyage(str(path), 30.0)
+
+
+def test_a_recorded_voyage_is_navigated(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(voyage_rows(gravity=False)))
+    rows = json.loads(
+        navigate(
+            "--voyage",
+            path,
+            "--filter",
+            "reference,pf",
+            "--period",
+            30,
+            "--runs",
+            2,
+            "--format",
+            "json",
+            "-q",
+        )
+    )
+    assert [row["filter"] for row in rows] == ["reference", "pf"]
+    assert all(row["rmse_position_m"] < row["ins_m"] for row in rows)
+
+
+def test_the_rows_have_their_names(quick, tmp_path):
+    out, raw = tmp_path / "curves.csv", tmp_path / "runs.csv"
+    rows = json.loads(
+        navigate("--config", quick, "--filter", "all", "--runs", 2, "--generations", 2, "--format", "json", "-q",
+                 "-o", out, "--raw", raw)
+    )  # fmt: skip
+    contract = {
+        "filter",
+        "mode",
+        "runs",
+        "rmse_position_m",
+        "rmse_latitude_m",
+        "rmse_longitude_m",
+        "lost",
+        "nees",
+        "seconds",
+    }
+    assert [row["filter"] for row in rows] == ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
+    assert all(contract <= set(row) for row in rows)
+    assert out.read_text().startswith("filter,mode,accelerometer_ug,seconds,rmse_latitude_m")
+    assert len(raw.read_text().splitlines()) == 11
+
+
+def test_jobs_do_not_change_the_result(quick):
+    common = ("--config", quick, "--filter", "pf", "--runs", 30, "--format", "json", "-q")
+    alone, together = (json.loads(navigate(*common, "--jobs", jobs))[0] for jobs in (1, 2))
+    assert alone["rmse_position_m"] == together["rmse_position_m"]
+
+
+def test_a_calibration_changes_the_ins(quick, tmp_path):
+    result = tmp_path / "result.yaml"
+    subprocess.run(
+        f"{sys.executable} -m accelcal_cli simulate --positions 24 --noise 1e-4 | "
+        f"{sys.executable} -m accelcal_cli calibrate - --g 9.80665 -q -o {result}",
+        shell=True, check=True, capture_output=True, cwd=ROOT,
+    )  # fmt: skip
+    rows = json.loads(
+        navigate(
+            "--config",
+            quick,
+            "--calibration",
+            result,
+            "--filter",
+            "reference",
+            "--runs",
+            2,
+            "--format",
+            "json",
+            "-q",
+        )
+    )
+    assert rows[0]["accelerometer_ug"] == 50.0
+    assert 0 < rows[1]["accelerometer_ug"] < 50.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--filter", "de-fp"), 'unknown filter "de-fp"'),
+        (("--map", "ruogh"), 'did you mean "rough"'),
+        (("--map", "nothing.xyz"), "no such file"),
+        (("--mode", "litteral"), 'did you mean "literal"'),
+        (("--period", "0.5"), "period"),
+        (("--particles", "1"), "particles"),
+        (("--voyage", "nothing.csv"), "nothing.csv"),
+        (("--calibration", "nothing.yaml"), "nothing.yaml"),
+        (("--resume",), "--raw"),
+        (("-o", "/nowhere/x.csv"), "no such folder"),
+    ],
+)
+def test_bad_usage_is_one_message(arguments, told):
+    assert told in navigate(*arguments, code=2)
+
+
+def test_a_map_that_ends_inside_the_track_is_refused(tmp_path):
+    path = write_xyz(tmp_path / "map.xyz", generate(SMALL, 0))
+    assert re.search(
+        r"the map ends at .* at hour \d", navigate("--map", path, "--filter", "pf", "--runs", 1, code=2)
+    )
+
+
+def test_a_hole_in_the_map_near_the_track_is_refused(tmp_path, quick):
+    grid = generate(Field(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0), 0)
+    holes = {(i, 60) for i in range(grid.values.shape[0])}
+    path = write_xyz(tmp_path / "map.xyz", grid, holes)
+    text = "plan: {hours: 4, turn: 0}\nperiod: 30\n"
+    quick.write_text(text)
+    assert "has a cell without a value" in navigate(
+        "--config", quick, "--map", path, "--filter", "pf", "--runs", 1, code=2
+    )
