@@ -40,7 +40,7 @@ def page(result: Calibration, title: str) -> str:
             result=result,
             title=title,
             headline=tables.headline(result),
-            parameters=[tables.parameters(result), tables.engineering(result)],
+            parameters=_parameters(result),
             fit=tables.fit(result),
             worst=tables.worst_poses(result),
             poses=tables.pose_residuals(result),
@@ -50,6 +50,12 @@ def page(result: Calibration, title: str) -> str:
             origin=_origin(result),
         )
     )
+
+
+def _parameters(result: Calibration) -> list[Table]:
+    slopes = result.temperature
+    warmth = [] if slopes is None else [tables.temperature(result, slopes)]
+    return [tables.parameters(result), tables.engineering(result), *warmth]
 
 
 def _environment() -> Environment:
