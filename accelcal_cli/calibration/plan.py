@@ -22,6 +22,10 @@ KINDS = (
 """Kinds of parameters with the unit that their sigma is shown in, and its size in parts of g."""
 
 
+SHORT = {"scale": "scale", "misalignment": "misal.", "bias": "bias"}
+"""Headings of the kinds, short enough for all of them to stand side by side."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """The next poses.
@@ -67,8 +71,8 @@ def pose_table(found: Plan) -> Table:
     rows = [_pose_row(found, k) for k in range(len(found.seen))]
     columns = [Column("pose", format="d"), Column("hold")]
     columns += [Column(axis, format=".3f") for axis in "xyz"]
-    columns += [Column(f"DOP {kind}", format=".3f", key=f"dop_{kind}") for kind, *_ in KINDS]
-    columns += [Column(f"sigma {kind}", unit, ".3g", f"sigma_{kind}") for kind, _, unit, _ in KINDS]
+    columns += [Column(f"DOP {SHORT[kind]}", format=".3f", key=f"dop_{kind}") for kind, *_ in KINDS]
+    columns += [Column(f"sigma {SHORT[kind]}", unit, ".3g", f"sigma_{kind}") for kind, _, unit, _ in KINDS]
     notes = (
         "x, y, z: direction of the specific force (up) in the sensor's axes. DOP and sigma: the largest of each kind "
         "after the pose; a dash where the poses do not determine it.",

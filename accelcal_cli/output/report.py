@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from accelcal_cli import __version__
 from accelcal_cli.calibration import tables
+from accelcal_cli.calibration.report_tables import headline, pose_residuals
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.config import dump
 from accelcal_cli.errors import UsageError
@@ -39,17 +40,23 @@ def page(result: Calibration, title: str) -> str:
         .render(
             result=result,
             title=title,
-            headline=tables.headline(result),
-            parameters=[tables.parameters(result), tables.engineering(result)],
+            headline=headline(result),
+            parameters=_parameters(result),
             fit=tables.fit(result),
             worst=tables.worst_poses(result),
-            poses=tables.pose_residuals(result),
+            poses=pose_residuals(result),
             observability=tables.observability(result),
             pictures=_pictures(result),
             settings=dump(result.record()["settings"]),
             origin=_origin(result),
         )
     )
+
+
+def _parameters(result: Calibration) -> list[Table]:
+    slopes = result.temperature
+    warmth = [] if slopes is None else [tables.temperature(result, slopes)]
+    return [tables.parameters(result), tables.engineering(result), *warmth]
 
 
 def _environment() -> Environment:

@@ -161,6 +161,14 @@ def test_every_table_has_a_caption_and_headings():
         assert not re.search(r"<th[^>]*></th>", table)
 
 
+def test_slopes_with_temperature_are_there_when_they_are_known():
+    warm = np.tile([10.0, 40.0, 25.0], 16)
+    output = MEMS.output(G * poses.fibonacci(48)) + 0.01 * (warm[:, None] - 25.0) + noise(48, 1e-3, 4)
+    result = calibrate(Readings.from_array(output, temperature=warm), Settings(g=G, optimizer="ellipsoid"))
+    assert result.temperature is not None
+    assert "The other parameters hold at" in page(result, "Sensor 7")
+
+
 def test_without_a_curve_there_is_no_picture_of_it(good):
     record = {**good.record(), "convergence": []}
     text = page(Calibration.from_record(record, "r"), "Sensor 7")
