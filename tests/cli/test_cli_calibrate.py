@@ -50,6 +50,7 @@ CONTRACT = {
     "notes": list,
     "version": str,
     "schema": str,
+    "temperature": (dict, type(None)),
 }
 """Names and types (or shapes) that programs rely on. A name that goes or changes needs a new schema."""
 
