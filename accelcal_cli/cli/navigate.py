@@ -164,14 +164,19 @@ def _entries(
 
 
 def _calibrated(waters: Waters, path: Path) -> tuple[Waters, tuple[Grade, ...]]:
-    """Return waters and the INS without and with a calibration; any drift is taken, for it is what differs."""
+    """Return waters and the INS without and with a calibration.
+
+    The accelerometers are strapped down: on a platform an alignment hides their biases. Any drift is taken that the
+    filters can start with.
+    """
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.config import load_mapping
     from accelcal_cli.studies.voyages import grade_of
 
     result = Calibration.from_record(load_mapping(path), str(path))
-    free = replace(waters, plan=replace(waters.plan, drift=(0.0, 1e6)))
-    return free, (waters.ins, grade_of(result, waters.ins, str(path)))
+    free = replace(waters, plan=replace(waters.plan, drift=(0.0, waters.initial)))
+    ins = replace(waters.ins, mounting="strapdown")
+    return free, (ins, grade_of(result, ins, str(path)))
 
 
 def show(study: Navigation, records: Sequence[Record], format: str) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -102,6 +103,21 @@ def discretise(A: Float, step: float) -> Float:
     return total
 
 
+def turned(F: Float, heading: Float) -> Float:
+    """Return transitions in which the level biases then turn with the vehicle.
+
+    Args:
+        F: shape (..., 12, 12); heading: change of the heading in the step, clockwise, rad, shape (...).
+    """
+    turn = np.zeros((*heading.shape, STATES, STATES))
+    turn[..., range(STATES), range(STATES)] = 1.0
+    for first in (7, 9):
+        turn[..., first, first] = turn[..., first + 1, first + 1] = np.cos(heading)
+        turn[..., first, first + 1], turn[..., first + 1, first] = np.sin(heading), -np.sin(heading)
+    product: Float = turn @ F
+    return product
+
+
 def metric(F: Float, before: Float, after: Float) -> Float:
     """Return a transition of metric states: position errors in metres north and east.
 
@@ -131,12 +147,16 @@ class Grade:
         accelerometer: sigma of the constant bias, micro-g.
         gyro: sigma of the constant drift, deg/h.
         noise: white noise of a 10 s step, as a part of what the bias and the drift do in it.
+        mounting: `platform`: level biases keep to east and north, as in [depf2015]; `strapdown`: they turn along.
     """
 
     accelerometer: float = setting(50.0, "sigma of the constant bias, micro-g", low=0.0, high=1e6)
     gyro: float = setting(0.01, "sigma of the constant drift, deg/h", low=0.0, high=1e4)
     noise: float = setting(
         0.1, "white noise of 10 s, as a part of what the biases do in it", low=0.0, high=100.0
+    )
+    mounting: Literal["platform", "strapdown"] = setting(
+        "platform", "whether level biases keep to east and north, or turn with the vehicle"
     )
 
     def __post_init__(self) -> None:

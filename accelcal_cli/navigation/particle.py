@@ -198,11 +198,13 @@ class Evolving(Sir):
         x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
         logs = np.take_along_axis(cloud.log_weights, order, axis=1)
         movers = max(1, round(self.fraction * self.particles))
-        x[..., :2] = self.evolve(x[..., :2], rate(x[..., :2]), movers, rate, streams)
-        logs[:, :movers] = self.likelihood(scenario, k, x[:, :movers]) + np.log(
-            np.take_along_axis(prior, order, axis=1)[:, :movers].mean(axis=1, keepdims=True) * self.particles
-            + 1e-300
-        )
+        place = x[..., :2]
+        moved = self.evolve(place, rate(place), movers, rate, streams)[:, :movers]
+        inside = np.isfinite(rate(moved))[:, :, None]
+        x[:, :movers, :2] = np.where(inside, moved, place[:, :movers])
+        share = np.take_along_axis(prior / prior.max(axis=1, keepdims=True), order, axis=1)[:, :movers]
+        likelihood = self.likelihood(scenario, k, x[:, :movers])
+        logs[:, :movers] = likelihood + np.log(share.mean(axis=1, keepdims=True) + 1e-300)
         return Cloud(x, logs), movers
 
     def fitness(self, scenario: Scenario, k: int, position: Float) -> Float:

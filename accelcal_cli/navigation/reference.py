@@ -27,6 +27,11 @@ TOGETHER = 0.01
 """Squared Mahalanobis distance of the positions below which a lighter component is merged into the heaviest."""
 
 
+MEMORY, UNFIT, WIDER = 30.0, 4.0, 4.0
+"""A component whose normalised innovation squared, 1 when all is well, is above UNFIT over MEMORY measurements is
+wrong: its covariance grows."""
+
+
 @dataclass(frozen=True)
 class Bank:
     """All components of all runs, M in all.
@@ -35,16 +40,20 @@ class Bank:
         run: whose they are, shape (M,), ascending.
         mean: metric states, shape (M, 12); P: covariances, shape (M, 12, 12).
         log_weight: shape (M,).
+        misfit: running mean of the normalised innovation squared, shape (M,).
     """
 
     run: Int
     mean: Float
     P: Float
     log_weight: Float
+    misfit: Float
 
     def at(self, chosen: Int | Bool) -> Bank:
         """Return some of the components."""
-        return Bank(self.run[chosen], self.mean[chosen], self.P[chosen], self.log_weight[chosen])
+        return Bank(
+            self.run[chosen], self.mean[chosen], self.P[chosen], self.log_weight[chosen], self.misfit[chosen]
+        )
 
 
 @FILTERS.register("reference")
@@ -70,7 +79,7 @@ class Reference(Filter):
             bank, known = _updated(scenario, bank, k)
             track.blind[:] += np.bincount(bank.run, known, scenario.runs) == 0
             track.mean[:, k], track.covariance[:, k] = _moments(bank, scenario.runs)
-            bank = _pruned(bank, scenario.runs)
+            bank = _widened(_pruned(bank, scenario.runs), scenario.initial)
             if k % CHUNK == 0:
                 F = scenario.transitions(k, min(k + CHUNK, scenario.epochs))
                 bank = _merged(bank)
@@ -94,6 +103,7 @@ class Reference(Filter):
             np.tile(mean, (runs, 1)),
             np.tile(np.diag(variance), (runs * count * count, 1, 1)),
             np.zeros(runs * count * count),
+            np.ones(runs * count * count),
         )
 
 
@@ -117,7 +127,8 @@ def _updated(scenario: Scenario, bank: Bank, k: int) -> tuple[Bank, Bool]:
     log_weight = bank.log_weight - np.where(used, 0.5 * misfit**2 / variance + 0.5 * np.log(variance), 0.0)
     mean = bank.mean + gain * (misfit / variance)[:, None]
     P = bank.P - gain[:, :, None] * gain[:, None, :] / variance[:, None, None]
-    return Bank(bank.run, mean, 0.5 * (P + P.swapaxes(1, 2)), log_weight), known
+    running = np.where(used, bank.misfit + (misfit**2 / variance - bank.misfit) / MEMORY, bank.misfit)
+    return Bank(bank.run, mean, 0.5 * (P + P.swapaxes(1, 2)), log_weight, running), known
 
 
 def _weights(bank: Bank, runs: int) -> Float:
@@ -146,6 +157,15 @@ def _pruned(bank: Bank, runs: int) -> Bank:
     weight = _weights(bank, runs)
     keep = weight > HOPELESS
     return bank if keep.all() else bank.at(keep)
+
+
+def _widened(bank: Bank, initial: float) -> Bank:
+    """Return the bank in which components whose innovations do not fit are wider, to the initial error at most."""
+    wrong = (bank.misfit > UNFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
+    if not wrong.any():
+        return bank
+    P = np.where(wrong[:, None, None], WIDER * bank.P, bank.P)
+    return replace(bank, P=P, misfit=np.where(wrong, 1.0, bank.misfit))
 
 
 def _merged(bank: Bank) -> Bank:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.navigation.earth import metres_per_radian
-from accelcal_cli.navigation.error_model import STATES, Grade, discretise, dynamics, metric
+from accelcal_cli.navigation.error_model import STATES, Grade, discretise, dynamics, metric, turned
 from accelcal_cli.navigation.gravity_map import GravityMap
 from accelcal_cli.navigation.voyage import INS_PURPOSE, SECONDS_PER_HOUR, Plan, Route, ins_errors, planned
 from accelcal_cli.streams import Float, Int, Streams
@@ -64,7 +64,7 @@ class Scenario:
 
         At the indicated latitude and velocity, as a real filter has it.
         """
-        return transitions(self.ins, first, last, self.period)
+        return transitions(self.ins, first, last, self.period, self.grade)
 
     def prior(self) -> Float:
         """Return the variances of the metric states at the start, shape (12,)."""
@@ -97,11 +97,14 @@ class Scenario:
         )
 
 
-def transitions(route: Route, first: int, last: int, period: float) -> Float:
+def transitions(route: Route, first: int, last: int, period: float, grade: Grade) -> Float:
     """Return the metric transitions along a track; see `Scenario.transitions`."""
     motion = route.motion()
     part = {name: getattr(motion, name)[..., first:last] for name in motion.__dataclass_fields__}
     F = discretise(dynamics(type(motion)(**part)), period)
+    if grade.mounting == "strapdown":
+        turns = np.concatenate([route.turns(), np.zeros((*route.east.shape[:-1], 1))], axis=-1)
+        F = turned(F, turns[..., first:last])
     after = np.minimum(np.arange(first + 1, last + 1), len(route.seconds) - 1)
     return metric(F, route.latitude[..., first:last], route.latitude[..., after])
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.navigation.earth import EARTH_RATE, metres_per_radian
-from accelcal_cli.navigation.error_model import STATES, Grade, Motion, dynamics, specific_force
+from accelcal_cli.navigation.error_model import STATES, Grade, Motion, dynamics, specific_force, turned
 from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float, Streams
 
@@ -80,6 +80,12 @@ class Route:
         """Time between points. Units: s."""
         return float(self.seconds[1] - self.seconds[0])
 
+    def turns(self) -> Float:
+        """Return the changes of the heading between points, clockwise, rad, shape (..., K - 1)."""
+        change = np.diff(np.arctan2(self.east, self.north), axis=-1)
+        nearest: Float = np.remainder(change + math.pi, 2.0 * math.pi) - math.pi
+        return nearest
+
     def motion(self) -> Motion:
         """Return the motion with the accelerations that the velocities give."""
         return Motion(
@@ -110,12 +116,13 @@ def _integral(rate: Float) -> Float:
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]))])
 
 
-def steps_of(route: Route) -> Float:
+def steps_of(route: Route, grade: Grade) -> Float:
     """Return the one-step matrices of the INS errors on a track, shape (K - 1, 12, 12), by the midpoint rule."""
     A = dynamics(route.motion())
     middle = 0.5 * (A[1:] + A[:-1])
     h = route.step
-    return np.eye(STATES) + h * middle + 0.5 * h * h * middle @ A[:-1]
+    steps: Float = np.eye(STATES) + h * middle + 0.5 * h * h * middle @ A[:-1]
+    return turned(steps, route.turns()) if grade.mounting == "strapdown" else steps
 
 
 def ins_errors(plan: Plan, route: Route, grade: Grade, streams: Streams, every: int) -> Float:
@@ -124,7 +131,7 @@ def ins_errors(plan: Plan, route: Route, grade: Grade, streams: Streams, every: 
     Raises:
         DataError: no draw gives a drift like the paper's: the INS is too good or too bad for the plan.
     """
-    steps = steps_of(route)
+    steps = steps_of(route, grade)
     start = round(plan.filtered * SECONDS_PER_HOUR)
     x = _aligned(plan, route, grade, streams, steps[:start])[:, :, None]
     white = grade.white()
