@@ -17,6 +17,7 @@ from accelcal_cli.sensor.dialect import BOM, Dialect, decode_line, is_blank
 
 LIMIT = 1e100  # larger values cannot be squared safely
 SHOWN = 40  # characters of a bad cell that are shown
+NO_LABEL = "is empty; every row needs its label"
 
 
 @dataclass(frozen=True)
@@ -25,16 +26,16 @@ class Selection:
 
     numbers: tuple[int, ...]
     gaps: frozenset[int] = frozenset()  # columns whose cells may be empty or nan
-    text: int | None = None  # a column read as text
+    texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
 
 
 @dataclass(frozen=True)
 class Rows:
-    """A block of rows: `numbers` (B, k) in the order of the selection, `text` of length B if asked for."""
+    """A block of rows: `numbers` (B, k) and `texts`, each of length B, in the order of the selection."""
 
     start: int
     numbers: NDArray[np.float64]
-    text: Sequence[str] | None = None
+    texts: tuple[Sequence[str], ...] = ()
 
 
 @dataclass
@@ -74,7 +75,8 @@ class CarefulParser:
 
     def parse(self, block: bytes) -> Rows:
         """Rows of a block of whole lines; the first wrong cell raises DataError."""
-        start, values, text = self.row, array("d"), []
+        start, values = self.row, array("d")
+        texts: tuple[list[str], ...] = tuple([] for _ in self.selection.texts)
         for raw in io.BytesIO(block):
             self.line += 1
             line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self.line, self.source)
@@ -83,11 +85,11 @@ class CarefulParser:
             cells = self._cells(line)
             self.lines.add(self.row, self.line)
             values.extend([self._number(cells[column], column) for column in self.selection.numbers])
-            if self.selection.text is not None:
-                text.append(self._label(cells[self.selection.text]))
+            for text, column in zip(texts, self.selection.texts, strict=True):
+                text.append(self._label(cells[column], column))
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
-        return Rows(start, numbers.reshape(-1, len(self.selection.numbers)), self._text(text))
+        return Rows(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
 
     def skip(self, rows: int) -> int:
         """Note that `rows` rows were read elsewhere, one a line; return the first one's number."""
@@ -96,9 +98,6 @@ class CarefulParser:
         self.row += rows
         self.line += rows
         return start
-
-    def _text(self, text: list[str]) -> list[str] | None:
-        return None if self.selection.text is None else text
 
     def _cells(self, line: str) -> list[str]:
         if line.count('"') % 2:
@@ -122,11 +121,10 @@ class CarefulParser:
         where = f"{self._here()}, column {self._column(column)}"
         raise DataError(f"{where}: {_complaint(cell, value, self.dialect.decimal_comma)}")
 
-    def _label(self, cell: str) -> str:
+    def _label(self, cell: str, column: int) -> str:
         if cell:
             return cell
-        column = self._column(self.selection.text or 0)
-        raise DataError(f"{self._here()}, column {column}: is empty; every row needs its position label")
+        raise DataError(f"{self._here()}, column {self._column(column)}: {NO_LABEL}")
 
     def _here(self) -> str:
         return f"{self.source}, line {self.line}"

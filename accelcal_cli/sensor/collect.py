@@ -77,9 +77,9 @@ class Collector:
         if self._means is None:
             self.store.append(output)
             self._keep_extras(rows.numbers[:, 3:])
-        elif rows.text is not None:
+        else:
             weight, spread, others = self._split(rows.numbers[:, 3:])
-            self._means.add(rows.text, np.hstack([output, others]), weight, spread)
+            self._means.add(rows.texts[0], np.hstack([output, others]), weight, spread)
 
     def finish(self) -> Extras:
         """Check the poses and return what came with them; `store` and `extent` then speak of poses."""

@@ -36,7 +36,7 @@ class Columns:
     def selection(self) -> Selection:
         """What to ask of the table; a standard deviation or temperature may be missing in a row."""
         gaps = frozenset((*(self.scatter or ()), *(() if self.temperature is None else (self.temperature,))))
-        return Selection((*self.output, *self.extras), gaps, self.label)
+        return Selection((*self.output, *self.extras), gaps, () if self.label is None else (self.label,))
 
 
 def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:

@@ -30,16 +30,15 @@ class FastParser:
             plain = form(block)
             frame = None if plain is None else self._frame(plain)
             numbers = None if frame is None else self._numbers(frame)
-            text = None if frame is None else self._text(frame)
-            if numbers is not None and text is not None:
-                asked = self.careful.selection.text is not None
-                return Rows(self.careful.skip(len(numbers)), numbers, text if asked else None)
+            texts = None if frame is None else self._texts(frame)
+            if numbers is not None and texts is not None:
+                return Rows(self.careful.skip(len(numbers)), numbers, texts)
         return self.careful.parse(block)
 
     def _bare(self, block: bytes) -> bytes | None:
         """The block as it is, where every column is read as a number, so that nothing odd can hide."""
         dialect, selection = self.careful.dialect, self.careful.selection
-        if len(set(selection.numbers)) < dialect.width or selection.text is not None:
+        if len(set(selection.numbers)) < dialect.width or selection.texts:
             return None
         doubtful = dialect.decimal_comma or not block.endswith(b"\n") or has_outer_blank_line(block)
         return None if doubtful else block
@@ -49,7 +48,7 @@ class FastParser:
         dialect = self.careful.dialect
         if b"#" in block or b"\0" in block or not block.endswith(b"\n"):
             return None
-        if self.careful.selection.text in self.careful.selection.numbers:
+        if not set(self.careful.selection.texts).isdisjoint(self.careful.selection.numbers):
             return None
         if dialect.decimal_comma and (b"." in block or dialect.separator == ","):
             return None
@@ -97,13 +96,15 @@ class FastParser:
         sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
         return numbers if sound else None
 
-    def _text(self, frame: pl.DataFrame) -> list[str] | None:
-        """Stripped text of the text column, [] where none is asked for, None where a cell is empty."""
-        column = self.careful.selection.text
-        if column is None:
-            return []
-        text = [(cell or "").strip() for cell in frame[str(column)].to_list()]
-        return text if all(text) else None
+    def _texts(self, frame: pl.DataFrame) -> tuple[list[str], ...] | None:
+        """Stripped text of the text columns, None where a cell is empty."""
+        found = []
+        for column in self.careful.selection.texts:
+            text = [(cell or "").strip() for cell in frame[str(column)].to_list()]
+            if not all(text):
+                return None
+            found.append(text)
+        return tuple(found)
 
 
 def has_outer_blank_line(block: bytes) -> bool:

@@ -13,7 +13,7 @@ import polars as pl
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.beside import Beside
-from accelcal_cli.sensor.cells import LIMIT, Rows, Selection
+from accelcal_cli.sensor.cells import LIMIT, NO_LABEL, Rows, Selection
 from accelcal_cli.sensor.source import ByteSource
 
 ROWS = 500_000  # rows of a block
@@ -52,7 +52,7 @@ class ParquetTable:
 
     def blocks(self, selection: Selection) -> Iterator[Rows]:
         """Read the selected columns."""
-        wanted = [self.names[k] for k in (*selection.numbers, *_text_column(selection))]
+        wanted = [self.names[k] for k in (*selection.numbers, *selection.texts)]
         for _, rows in self._read(selection, sorted(set(wanted), key=wanted.index)):
             yield rows
 
@@ -71,7 +71,8 @@ class ParquetTable:
                 series = frame[self.names[column]].cast(pl.Float64).fill_null(float("nan"))
                 numbers[:, k] = series.to_numpy()
                 self._check(numbers[:, k], start, column, column in selection.gaps)
-            yield frame, Rows(start, numbers, self._labels(frame, start, selection.text))
+            labels = tuple(self._labels(frame, start, column) for column in selection.texts)
+            yield frame, Rows(start, numbers, labels)
             start += frame.height
 
     @property
@@ -122,19 +123,13 @@ class ParquetTable:
             where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
             raise DataError(f"{where}: {what}; a finite number was expected")
 
-    def _labels(self, frame: pl.DataFrame, start: int, column: int | None) -> list[str] | None:
-        if column is None:
-            return None
+    def _labels(self, frame: pl.DataFrame, start: int, column: int) -> list[str]:
         labels: list[str | None] = frame[self.names[column]].cast(pl.String).to_list()
         for row, label in enumerate(labels):
             if not label:
                 where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
-                raise DataError(f"{where}: is empty; every row needs its position label")
+                raise DataError(f"{where}: {NO_LABEL}")
         return [label or "" for label in labels]
-
-
-def _text_column(selection: Selection) -> tuple[int, ...]:
-    return () if selection.text is None else (selection.text,)
 
 
 def _row(row: int) -> str:

@@ -47,11 +47,11 @@ def tables(draw: st.DrawFn) -> tuple[bytes, Dialect, Selection]:
         lines[at] = draw(odd_lines(lines[at], separator))
     data = draw(st.sampled_from(["\n", "\r\n"])).join([*lines, ""] if draw(st.booleans()) else lines).encode()
     numbers = draw(st.lists(st.integers(0, width - 1), min_size=1, max_size=4))
-    text = draw(st.sampled_from([None, None, *range(width)]))
+    texts = draw(st.sampled_from([(), (), *((k,) for k in range(width)), (width - 1, 0)]))
     gaps = frozenset(draw(st.lists(st.sampled_from(numbers), max_size=2)))
     names = draw(st.sampled_from([None, tuple(f"c{k}" for k in range(width))]))
     first = tuple("0" * width)
-    return data, Dialect(separator, decimal_comma, names, 0, first), Selection(tuple(numbers), gaps, text)
+    return data, Dialect(separator, decimal_comma, names, 0, first), Selection(tuple(numbers), gaps, texts)
 
 
 @st.composite
@@ -99,7 +99,7 @@ def quoted(draw: st.DrawFn, line: str, separator: str) -> str:
     return separator.join(draw(st.sampled_from(forms[:usual])).format(cell) for cell in line.split(separator))
 
 
-Outcome = tuple[list[tuple[str, ...]], list[str], list[int]] | str
+Outcome = tuple[list[tuple[str, ...]], list[tuple[str, ...]], list[int]] | str
 
 
 def outcome(data: bytes, dialect: Dialect, selection: Selection, fast: bool, block: int) -> Outcome:
@@ -107,7 +107,7 @@ def outcome(data: bytes, dialect: Dialect, selection: Selection, fast: bool, blo
     careful = CarefulParser("f", dialect, selection)
     parse = FastParser(careful).parse if fast else careful.parse
     numbers: list[tuple[str, ...]] = []
-    text: list[str] = []
+    text: list[tuple[str, ...]] = []
     head = data.find(b"\n") + 1 + block  # the first line end tells lone carriage returns from line ends
     source = ByteSource(io.BytesIO(data), "f", head=head, block=block)
     try:
@@ -115,7 +115,7 @@ def outcome(data: bytes, dialect: Dialect, selection: Selection, fast: bool, blo
             rows = parse(piece)
             assert rows.start == len(numbers)
             numbers += [tuple(value.hex() for value in row) for row in rows.numbers.tolist()]
-            text += rows.text or []
+            text += zip(*rows.texts, strict=True)
     except DataError as problem:
         return str(problem)
     finally:
@@ -160,8 +160,8 @@ def test_plain_tables_take_the_fast_path(separator: str, comma: bool, row: str, 
 
 def test_other_columns_take_the_fast_path_too() -> None:
     """A log with words in columns that are not read."""
-    careful = CarefulParser("f", Dialect(",", False, None, 0, ("0",) * 3), Selection((1,), text=2))
+    careful = CarefulParser("f", Dialect(",", False, None, 0, ("0",) * 3), Selection((1,), texts=(2,)))
     careful.parse = None  # type: ignore[method-assign, assignment]
     rows = FastParser(careful).parse('état,2.5,üp side\n"a b","2.5","üp side"\n'.encode() * 50)
     assert rows.numbers.tolist() == [[2.5]] * 100
-    assert rows.text == ["üp side"] * 100
+    assert rows.texts == (["üp side"] * 100,)
