@@ -31,29 +31,41 @@ class Streams:
     """
 
     def __init__(self, seed: int, runs: Iterable[int], purpose: int = 0) -> None:
-        """Seed one generator for every run from (seed, purpose, run)."""
-        self.generators = [Generator(SFC64(SeedSequence(seed, spawn_key=(purpose, run)))) for run in runs]
+        """Seed one generator for every run from (seed, purpose, run), when the first number is drawn."""
+        self._seed, self._purpose, self._runs = seed, purpose, tuple(runs)
+        self._started: list[Generator] | None = None
+
+    @property
+    def generators(self) -> list[Generator]:
+        """One generator a run; an algorithm that draws nothing never pays for them."""
+        if self._started is None:
+            self._started = [
+                Generator(SFC64(SeedSequence(self._seed, spawn_key=(self._purpose, run))))
+                for run in self._runs
+            ]
+        return self._started
 
     def __len__(self) -> int:
         """R, the number of runs."""
-        return len(self.generators)
+        return len(self._runs)
 
     def uniform(self, rows: int, columns: int) -> Float:
         """Return U[0, 1) numbers, shape (R, rows, columns), population-contiguous."""
-        out = np.empty((len(self.generators), columns, rows))
+        out = np.empty((len(self), columns, rows))
         for generator, part in zip(self.generators, out, strict=True):
             generator.random(out=part)
         return out.transpose(0, 2, 1)
 
     def normal(self, rows: int, columns: int) -> Float:
         """Return N(0, 1) numbers, shape (R, rows, columns), population-contiguous."""
-        out = np.empty((len(self.generators), columns, rows))
+        out = np.empty((len(self), columns, rows))
         for generator, part in zip(self.generators, out, strict=True):
             generator.standard_normal(out=part)
         return out.transpose(0, 2, 1)
 
     def take(self, index: Int) -> Streams:
         """Return the streams of the runs at `index`, going on where they stand."""
-        chosen = Streams(0, ())
-        chosen.generators = [self.generators[i] for i in index]
+        chosen = Streams(self._seed, (self._runs[i] for i in index), self._purpose)
+        if self._started is not None:
+            chosen._started = [self._started[i] for i in index]
         return chosen

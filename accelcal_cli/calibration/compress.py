@@ -29,17 +29,17 @@ class Triangle:
         R: upper triangles, shape (R, 11, 11), of the rows [phi(x), 1].
         centre: c, shape (R, 3), output units.
         scale: s, shape (R,), output units.
-        poses: J, the number of readings of each sensor.
+        poses: J, the number of readings of each sensor, shape (R,).
     """
 
     R: Float
     centre: Float
     scale: Float
-    poses: int
+    poses: Int
 
     def take(self, index: Int) -> Triangle:
         """Return the triangles of the sensors at `index`."""
-        return Triangle(self.R[index], self.centre[index], self.scale[index], self.poses)
+        return Triangle(self.R[index], self.centre[index], self.scale[index], self.poses[index])
 
 
 def rows(x: Float) -> Float:
@@ -74,11 +74,14 @@ def compress(blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale:
         if weight is not None:
             table *= np.sqrt(weight)[:, None]
         R = _triangle(np.concatenate([R, _pieces(table)]))
-    return Triangle(R[None], np.asarray(centre)[None], np.array([scale]), poses)
+    return Triangle(R[None], np.asarray(centre)[None], np.array([scale]), np.array([poses]))
 
 
-def compress_each(readings: Float, weights: Float | None = None) -> Triangle:
-    """Compress the readings of R sensors with J poses each, shape (R, J, 3), weights (R, J) or None."""
+def compress_each(readings: Float, weights: Float | None = None, poses: Int | None = None) -> Triangle:
+    """Compress the readings of R sensors with J poses each, shape (R, J, 3), weights (R, J) or None.
+
+    Sensors with fewer poses repeat one of them with weight zero; `poses`, shape (R,), says how many there are.
+    """
     low, high = readings.min(axis=1), readings.max(axis=1)
     centre, scale = 0.5 * (low + high), 0.5 * (high - low).max(axis=1)
     table = rows((readings - centre[:, None]) / scale[:, None, None])
@@ -86,7 +89,8 @@ def compress_each(readings: Float, weights: Float | None = None) -> Triangle:
         table *= np.sqrt(weights)[..., None]
     if table.shape[1] < 11:
         table = np.concatenate([table, np.zeros((len(table), 11 - table.shape[1], 11))], axis=1)
-    return Triangle(_triangle(table), centre, scale, readings.shape[1])
+    each = np.full(len(readings), readings.shape[1]) if poses is None else poses
+    return Triangle(_triangle(table), centre, scale, each)
 
 
 def _pieces(table: Float) -> Float:

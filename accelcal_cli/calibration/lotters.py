@@ -56,6 +56,10 @@ class Box:
     centre: Float
     half: Float
 
+    def take(self, index: Int) -> Box:
+        """Return the boxes of the sensors at `index`."""
+        return Box(self.centre[index], self.half[index])
+
 
 class Loetters(Problem):
     """The cost of one sensor, or of R sensors at once, over u in [-1, 1]^D.
@@ -162,7 +166,7 @@ class Loetters(Problem):
         """Return the problem of the sensors at `index`; itself when all runs share one sensor."""
         if len(self.triangle.scale) == 1:
             return self
-        return Loetters(self.triangle.take(index), self.g, Box(self.box.centre[index], self.box.half[index]))
+        return Loetters(self.triangle.take(index), self.g, self.box.take(index))
 
     def parameters(self, x: Float) -> tuple[Float, Float]:
         """Return K_a, shape (R, 3, 3), and D_a, shape (R, 3), in the readings' units at x, shape (R, D)."""

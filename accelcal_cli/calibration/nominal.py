@@ -9,10 +9,10 @@ import numpy as np
 from accelcal_cli.calibration.compress import Triangle
 from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
-from accelcal_cli.calibration.quality import Observability, information
+from accelcal_cli.calibration.quality import Observabilities, information
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.sensor.model import to_gauge
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Bool, Float, Int, Streams
 
 BOX_PURPOSE = 1
 """Stream of the random shift of the box, apart from the searches' own streams."""
@@ -29,68 +29,91 @@ whose scale factors differ by 3 % pretend to say about an axis that the poses do
 
 @dataclass(frozen=True)
 class Start:
-    """Where a search starts.
+    """Where searches start.
 
     Attributes:
-        box: the search box, one sensor, D = 9 or 12.
-        source: "stated", "closed form" or "sphere".
+        box: the search box of each of R sensors, D = 9 or 12.
+        sources: of each: "stated", "closed form" or "sphere".
     """
 
     box: Box
-    source: str
+    sources: tuple[str, ...]
+
+    @property
+    def source(self) -> str:
+        """That of the first sensor."""
+        return self.sources[0]
+
+    def take(self, index: Int) -> Start:
+        """Return the starts of the sensors at `index`."""
+        return Start(self.box.take(index), tuple(self.sources[i] for i in index))
 
 
 def search_box(triangle: Triangle, settings: Settings) -> Start:
-    """Return the search box of one sensor.
+    """Return the search box of each sensor; the same in any company.
 
     Args:
-        triangle: its compressed readings.
+        triangle: the compressed readings of R sensors.
         settings: stated nominal, half-widths, gauge, seed.
     """
     unknowns = 12 if settings.gauge == "full" else 9
-    K, D = _closed_form(triangle, settings.g)
+    sensors = len(triangle.scale)
     if settings.nominal is not None:
-        K, D, source = np.diag(settings.nominal.scale), np.array(settings.nominal.bias), "stated"
-    elif np.isfinite(K).all() and _trustworthy(triangle, K, D, settings):
-        # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
-        K, source = (to_gauge(K, "symmetric") if unknowns == 12 else K), "closed form"
-    else:
-        K, D, source = *_sphere(triangle, settings.g), "sphere"
-    half = half_widths(np.diagonal(K), settings.box, settings.g, unknowns)
-    centre = pack(K, D, unknowns)
-    if source == "closed form":
-        u = Streams(settings.seed, [0], purpose=BOX_PURPOSE).uniform(1, unknowns)[0, 0]
-        centre = centre + SHIFT * (2.0 * u - 1.0) * half
-    return Start(Box(centre[None], half[None]), source)
+        K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))
+        D = np.broadcast_to(settings.nominal.bias, (sensors, 3))
+        return Start(_box(K, D, settings, unknowns), ("stated",) * sensors)
+    K, D = _closed_form(triangle, settings.g)
+    index = np.flatnonzero(np.isfinite(K).all(axis=(1, 2)))
+    index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
+    closed = np.zeros(sensors, dtype=bool)
+    closed[index] = True
+    sphere_K, sphere_D = _sphere(triangle, settings.g)
+    if (
+        unknowns == 12
+    ):  # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
+        K[index] = to_gauge(K[index], "symmetric")
+    K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
+    box = _box(K, D, settings, unknowns)
+    u = Streams(settings.seed, [0], purpose=BOX_PURPOSE).uniform(1, unknowns)[0, 0]
+    moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
+    return Start(
+        Box(np.where(closed[:, None], moved, box.centre), box.half),
+        tuple("closed form" if c else "sphere" for c in closed),
+    )
+
+
+def _box(K: Float, D: Float, settings: Settings, unknowns: int) -> Box:
+    half = half_widths(np.einsum("rii->ri", K), settings.box, settings.g, unknowns)
+    return Box(pack(K, D, unknowns), half)
 
 
 def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
     K, d = fit_ellipsoid(triangle)
-    return K[0] * triangle.scale[0] / g, d[0] * triangle.scale[0] + triangle.centre[0]
+    return K * triangle.scale[:, None, None] / g, d * triangle.scale[:, None] + triangle.centre
 
 
-def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> bool:
-    """Whether the poses determine what the closed form says; where they do not, noise has decided it."""
-    box = Box(pack(K, D, 9)[None], half_widths(np.diagonal(K), settings.box, settings.g, 9)[None])
-    seen = Observability.of(
-        information(Loetters(triangle, settings.g, box), np.zeros((1, 9)))[0], triangle.poses
-    )
-    return seen.verdict != "undetermined"
+def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> Bool:
+    """Whether the poses determine what the closed form says, shape (R,); where they do not, noise has decided it."""
+    problem = Loetters(triangle, settings.g, _box(K, D, settings, 9))
+    seen = Observabilities.of(information(problem, np.zeros((len(K), 9))), triangle.poses)
+    return np.array([verdict != "undetermined" for verdict in seen.verdicts], dtype=bool)
 
 
 def _sphere(triangle: Triangle, g: float) -> tuple[Float, Float]:
-    """Return K and D of the sphere nearest to readings that fix no ellipsoid.
+    """Return K, shape (R, 3, 3), and D, shape (R, 3), of the spheres nearest to readings that fix no ellipsoid.
 
     |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant. A direction that the poses do not turn through
     is held at the middle of the readings by the prior.
     """
-    left, right = triangle.R[0][:, 6:10], triangle.R[0][:, :3].sum(axis=1)
-    prior = SPHERE_PRIOR * triangle.poses * np.diag([1.0, 1.0, 1.0, 0.0])
-    c = np.linalg.solve(left.T @ left + prior, left.T @ right)
-    radius = np.sqrt(max(c[3] + c[:3] @ c[:3], 0.0))
-    if not 0.3 < radius < 3.0:  # far from the readings' own extent, which is 1
-        radius = 1.0
-    return radius * triangle.scale[0] / g * np.eye(3), c[:3] * triangle.scale[0] + triangle.centre[0]
+    left, right = triangle.R[..., 6:10], triangle.R[..., :3].sum(axis=2)
+    transposed = left.swapaxes(1, 2)
+    prior = SPHERE_PRIOR * triangle.poses[:, None, None] * np.diag([1.0, 1.0, 1.0, 0.0])
+    c = np.linalg.solve(transposed @ left + prior, transposed @ right[..., None])[..., 0]
+    radius = np.sqrt(np.maximum(c[:, 3] + np.sum(c[:, :3] ** 2, axis=1), 0.0))
+    # Far from the readings' own extent, which is 1, it is noise.
+    radius = np.where((radius > 0.3) & (radius < 3.0), radius, 1.0)
+    K = (radius * triangle.scale / g)[:, None, None] * np.eye(3)
+    return K, c[:, :3] * triangle.scale[:, None] + triangle.centre
 
 
 def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Float:

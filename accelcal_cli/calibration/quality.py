@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS, Loetters, pack
-from accelcal_cli.streams import Float
+from accelcal_cli.streams import Float, Int
 
 PARAMETERS = (
     "scale factor x",
@@ -47,6 +47,13 @@ def design(u: Float) -> Float:
     return np.stack([*(-p for p in pairs), u[:, 0], u[:, 1], u[:, 2]], axis=1)
 
 
+def verdict_of(worst: float, rank: int) -> Verdict:
+    """Return the verdict on poses that determine `rank` directions, with this largest dilution of precision."""
+    if rank < 9 or worst > UNDETERMINED:
+        return "undetermined"
+    return "weak" if worst > WEAK else "good"
+
+
 PRIOR = 1e-6
 """Information that physics lends to every parameter when it comes to naming the undetermined ones: none is off by
 more than 1000 times the noise of a pose. Without it a direction that the poses say nothing of would take every
@@ -72,15 +79,7 @@ class Observability:
     @classmethod
     def of(cls, information: Float, poses: int) -> Observability:
         """Return the observability of an information matrix J^T J, shape (9, 9), from `poses` poses."""
-        values, vectors = np.linalg.eigh(information)
-        known = values > RANK_TOLERANCE * values[-1]
-        inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
-        cofactor = (vectors * inverse) @ vectors.T
-        bounded = np.sqrt(np.diagonal((vectors / (np.maximum(values, 0.0) + PRIOR)) @ vectors.T))
-        dop = np.sqrt(np.diagonal(cofactor))
-        if not known.all():
-            dop = np.where(bounded > UNDETERMINED, np.inf, bounded)
-        return cls(cofactor, dop, bounded, min(int(known.sum()), poses))
+        return Observabilities.of(information[None], np.array([poses])).one(0)
 
     @property
     def worst(self) -> float:
@@ -90,14 +89,52 @@ class Observability:
     @property
     def verdict(self) -> Verdict:
         """Definition: undetermined above 25 or below rank 9, weak above 10, good otherwise."""
-        if self.rank < 9 or self.worst > UNDETERMINED:
-            return "undetermined"
-        return "weak" if self.worst > WEAK else "good"
+        return verdict_of(self.worst, self.rank)
 
     def above(self, limit: float) -> list[str]:
         """Return the names of the parameters whose bounded dilution of precision is above `limit`, worst first."""
         order = np.argsort(-np.round(self.bounded, 3), kind="stable")
         return [PARAMETERS[i] for i in order if self.bounded[i] > limit]
+
+
+@dataclass(frozen=True)
+class Observabilities:
+    """What R sets of poses say about the parameters; see `Observability`.
+
+    Attributes:
+        cofactor: shape (R, 9, 9); dop, bounded: shape (R, 9); rank: shape (R,).
+    """
+
+    cofactor: Float
+    dop: Float
+    bounded: Float
+    rank: Int
+
+    @classmethod
+    def of(cls, information: Float, poses: Int) -> Observabilities:
+        """Return the observability of matrices J^T J, shape (R, 9, 9), from so many poses, shape (R,)."""
+        values, vectors = np.linalg.eigh(information)
+        transposed = vectors.swapaxes(1, 2)
+        known = values > RANK_TOLERANCE * values[:, -1:]
+        inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
+        cofactor = (vectors * inverse[:, None]) @ transposed
+        # The square sum of a row of the eigenvectors, each weighted, is what stands in the diagonal.
+        bounded = np.sqrt((vectors**2 @ (1.0 / (np.maximum(values, 0.0) + PRIOR))[..., None])[..., 0])
+        dop = np.sqrt(np.einsum("rpp->rp", cofactor))
+        whole = known.all(axis=1, keepdims=True)
+        dop = np.where(whole, dop, np.where(bounded > UNDETERMINED, np.inf, bounded))
+        return cls(cofactor, dop, bounded, np.minimum(known.sum(axis=1), poses))
+
+    def one(self, index: int) -> Observability:
+        """Return what the set of poses number `index` says."""
+        return Observability(
+            self.cofactor[index], self.dop[index], self.bounded[index], int(self.rank[index])
+        )
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """Return the verdict on every set of poses."""
+        return [verdict_of(*pair) for pair in zip(self.dop.max(axis=1), self.rank, strict=True)]
 
 
 def jacobian(problem: Loetters, x: Float) -> Float:
@@ -125,54 +162,56 @@ def information(problem: Loetters, x: Float) -> Float:
 
 
 def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float) -> tuple[Float, Float]:
-    """Return one-sigma of K_a in a gauge, shape (3, 3), and of D_a, shape (3,).
+    """Return one-sigma of K_a in a gauge, shape (..., 3, 3), and of D_a, shape (..., 3).
 
     Args:
-        K: K_a in `gauge`; K_lower: the same sensor in gauge `lower`.
-        covariance: of the nine parameters, (m/s^2)^2, shape (9, 9).
+        K: K_a in `gauge`, shape (..., 3, 3); K_lower: the same sensors in gauge `lower`.
+        covariance: of the nine parameters, (m/s^2)^2, shape (..., 9, 9).
         gauge: `lower`, `upper` or `symmetric`; in `full` the free rotation moves every entry of K_a, the diagonal to
             second order, and they come out as NaN.
         g: local gravity, m/s^2.
     """
-    sigma_D = np.sqrt(np.diagonal(covariance)[BIAS]) * np.diagonal(K_lower)
+    variance = np.einsum("...pp->...p", covariance)
+    sigma_D = np.sqrt(variance[..., BIAS]) * np.einsum("...ii->...i", K_lower)
     if gauge == "full":
-        return np.full((3, 3), np.nan), sigma_D
+        return np.full(K.shape, np.nan), sigma_D
     chain = gauge_chain(K, K_lower, gauge, g)
-    lost = np.isnan(np.diagonal(covariance)[:6])
-    variance = np.einsum("ip,pq,iq->i", chain, np.nan_to_num(covariance[:6, :6]), chain)
-    touched = (np.abs(chain[:, lost]) > 1e-9 * np.abs(chain).max()).any(axis=1)
-    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(variance, 0.0))).reshape(3, 3)
+    lost = np.isnan(variance[..., :6])
+    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance[..., :6, :6]), chain)
+    size = np.abs(chain)
+    felt = size > 1e-9 * size.max(axis=(-1, -2), keepdims=True)
+    touched = (felt & lost[..., None, :]).any(axis=-1)
+    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(square, 0.0))).reshape(K.shape)
     exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
     # A zero of the gauge has no error.
     return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
 
 
 def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
-    """Return d K / d parameters, shape (9, 6): the entries of K_a in a gauge by the first six of the nine parameters.
+    """Return d K / d parameters, shape (..., 9, 6): entries of K_a in a gauge by the first six of the nine parameters.
 
     A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
     small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
     W leaves the body frame unturned.
     """
     R = np.linalg.solve(K, K_lower)
-    skew = [_skew(axis) for axis in np.eye(3)]
-    turns = np.stack([_conditions(K @ w, gauge) for w in skew], axis=1)
+    turned = [K @ _skew(axis) for axis in np.eye(3)]
+    turns = np.stack([_conditions(change, gauge) for change in turned], axis=-1)
     columns = []
     for i, j in ROWS_COLUMNS[:6]:
-        E = np.zeros((3, 3))
-        E[i, j] = 1.0 / g
-        moved = R @ E @ R.T
-        change = -0.5 * K @ (moved + moved.T)
+        moved = R[..., :, i, None] * R[..., None, :, j] / g  # R E R^T
+        change = -0.5 * K @ (moved + moved.swapaxes(-1, -2))
         if gauge != "full":
-            angle = np.linalg.solve(turns, -_conditions(change, gauge))
-            change = change + K @ sum(a * w for a, w in zip(angle, skew, strict=True))
-        columns.append(change.ravel())
-    return np.stack(columns, axis=1)
+            angle = np.linalg.solve(turns, -_conditions(change, gauge)[..., None])
+            for k, turn in enumerate(turned):
+                change = change + angle[..., k, :, None] * turn
+        columns.append(change.reshape(*K.shape[:-2], 9))
+    return np.stack(columns, axis=-1)
 
 
 def _conditions(change: Float, gauge: str) -> Float:
-    """Return what must vanish for a change of K to stay in the gauge, shape (3,)."""
-    above, below = change[[0, 0, 1], [1, 2, 2]], change[[1, 2, 2], [0, 0, 1]]
+    """Return what must vanish for a change of K to stay in the gauge, shape (..., 3)."""
+    above, below = change[..., [0, 0, 1], [1, 2, 2]], change[..., [1, 2, 2], [0, 0, 1]]
     return {"lower": above, "upper": below}.get(gauge, above - below)
 
 

@@ -69,7 +69,7 @@ def search(problem: Loetters, settings: Settings) -> Solution:
         evaluations += int(polished.evaluations.sum())
         x, cost = polished.x, polished.cost
     best = int(np.nanargmin(cost))
-    floor = ROUNDING * problem.triangle.poses * problem.g**4
+    floor = ROUNDING * problem.triangle.poses.max() * problem.g**4
     agreeing = int((cost <= cost[best] * (1.0 + SAME_MINIMUM) + floor).sum())
     return Solution(problem, x[best : best + 1], found, best, float(cost[best]), evaluations, agreeing)
 

@@ -148,7 +148,10 @@ def simulated(source: Simulation, space: Search, runs: Sequence[int], seed: int)
 def recorded(source: Recording, space: Search, runs: Sequence[int], seed: int) -> Scene:
     """Return the scene of a recording for the runs of these numbers."""
     one = Triangle(
-        np.array([source.triangle]), np.array([source.centre]), np.array([source.scale]), source.poses
+        np.array([source.triangle]),
+        np.array([source.centre]),
+        np.array([source.scale]),
+        np.array([source.poses]),
     )
     triangle = one.take(np.zeros(len(runs), dtype=np.intp))
     problem = Loetters(triangle, space.g, _box(triangle, space, runs, seed))

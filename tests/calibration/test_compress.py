@@ -127,4 +127,4 @@ def test_taking_sensors():
     np.testing.assert_array_equal(part.R, triangle.R[[2, 0]])
     np.testing.assert_array_equal(part.centre, triangle.centre[[2, 0]])
     np.testing.assert_array_equal(part.scale, triangle.scale[[2, 0]])
-    assert part.poses == 12
+    assert part.poses.tolist() == [12] * len(part.scale)
