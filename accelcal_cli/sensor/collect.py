@@ -61,7 +61,7 @@ class Collector:
         self.notes = list(columns.notes)
         self.store = RowStore()
         self.extent = Extent()
-        self._means = None if columns.label is None else LabelledMeans(source, 3 + _others(columns))
+        self._means = None if columns.label is None else LabelledMeans[str](source, 3 + _others(columns))
         self._extras: list[Floats] | None = [] if columns.extras else None
 
     def add(self, rows: Rows) -> None:
@@ -118,7 +118,7 @@ class Collector:
         count, scatter, others = self._split(np.concatenate(self._extras))
         return Extras(None, count, scatter, *self._others(others))
 
-    def _by_label(self, means: LabelledMeans) -> Extras:
+    def _by_label(self, means: LabelledMeans[str]) -> Extras:
         if len(means.rows):
             self.extent = Extent()
             self.extent.add(means.mean[:, :3])

@@ -33,6 +33,11 @@ _GYRO = (
 )
 _TIME = re.compile(r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?")
 _LABEL = re.compile(r"pose|poses|poseid|poselabel|posename|position|positionid|pos|label|orientation|face")
+_SENSOR = re.compile(
+    r"(?:sensor|device|serial|imu|accelerometer|dut|node|board|chip|module|unit|part)"
+    r"(?:id|no|nr|num|number|name|label|serial|serialno|serialnr|serialnumber|sn)|sensors?|device|serial|sn|imu|dut"
+)
+_SENSOR_PERHAPS = re.compile(r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer")
 _COUNT = frozenset({"n", "count", "counts", "samples", "nsamples", "numsamples", "npoints"})
 _TEMPERATURE = frozenset({"temperature", "temp"})
 _OTHER = re.compile(
@@ -51,6 +56,8 @@ class Roles:
     label: int | None = None
     count: int | None = None
     temperature: int | None = None
+    sensors: list[int] = field(default_factory=list)  # which sensor a row is of
+    perhaps_sensors: list[int] = field(default_factory=list)  # the same, where no other column says so
     doubtful: list[str] = field(default_factory=list)  # names that come twice where one is needed
     other: set[int] = field(default_factory=set)  # known to be no readings: time, row number
     partial: list[str] = field(default_factory=list)  # triples that lack an axis, in words
@@ -111,12 +118,16 @@ def time_column(names: Sequence[str]) -> int | None:
 
 def _single(roles: Roles, column: int, name: str, key: str) -> bool:
     """Settle a column that stands alone; of two of a kind the first counts."""
+    if _SENSOR_PERHAPS.fullmatch(key):
+        roles.perhaps_sensors.append(column)
     if key in _TEMPERATURE or _CAPITAL_T.fullmatch(name.strip()):
         roles.temperature = column if roles.temperature is None else roles.temperature
     elif _LABEL.fullmatch(key):
         roles.label = column if roles.label is None else roles.label
     elif key in _COUNT:
         roles.count = column if roles.count is None else roles.count
+    elif _SENSOR.fullmatch(key):
+        roles.sensors.append(column)
     elif _OTHER.fullmatch(key) or not key:
         roles.other.add(column)
     else:

@@ -19,6 +19,7 @@ class Columns:
 
     output: Triple
     names: tuple[str, str, str]
+    sensor: int | None = None
     label: int | None = None
     count: int | None = None
     scatter: Triple | None = None
@@ -36,11 +37,15 @@ class Columns:
     def selection(self) -> Selection:
         """What to ask of the table; a standard deviation or temperature may be missing in a row."""
         gaps = frozenset((*(self.scatter or ()), *(() if self.temperature is None else (self.temperature,))))
-        return Selection((*self.output, *self.extras), gaps, () if self.label is None else (self.label,))
+        texts = tuple(column for column in (self.sensor, self.label) if column is not None)
+        return Selection((*self.output, *self.extras), gaps, texts)
 
 
-def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
-    """Find the three output columns and the optional ones; DataError or UsageError if in doubt."""
+def choose(table: Table, wanted: Sequence[str] | None = None, sensor: int | None = None) -> Columns:
+    """Find the three output columns and the optional ones; DataError or UsageError if in doubt.
+
+    `sensor` is the column that says which sensor a row is of, in a table of many.
+    """
     if not table.has_rows:
         raise DataError(f"{table.name}: has a header but no readings below it")
     names = table.names
@@ -49,14 +54,15 @@ def choose(table: Table, wanted: Sequence[str] | None = None) -> Columns:
     if wanted is not None:
         output = stated(table, [wanted] if isinstance(wanted, str) else wanted)
     elif names is None:
-        output = _nameless(table)
-        note = ("no header: columns 1, 2, 3 taken as x, y, z",)
+        output = _nameless(table, sensor)
+        shown = ", ".join(str(k + 1) for k in output)
+        note = (f"no header: columns {shown} taken as x, y, z",)
     elif roles.families:
         output = _only_family(table, roles)
     else:
-        output = _only_numeric(table, names, roles)
+        output = _only_numeric(table, names, roles, sensor)
         note = (f"columns {_listed(names, output)} taken as x, y, z: the only three that can be",)
-    return _with_extras(table, output, roles, note)
+    return _with_extras(table, output, roles, note, sensor)
 
 
 def stated(table: Table, wanted: Sequence[str], option: str = "--columns") -> Triple:
@@ -93,10 +99,41 @@ def find_column(table: Table, word: str, option: str = "--columns") -> int:
     raise UsageError(f'{option}: no column "{word}" in {table.name}{hint}')
 
 
-def _nameless(table: Table) -> Triple:
+def sensor_columns(table: Table) -> tuple[list[int], list[int]]:
+    """Return the columns whose names say that they label the sensor, and those that may do so."""
+    roles = recognise(table.names or ())
+    return roles.sensors, roles.perhaps_sensors
+
+
+def sensor_column(table: Table, wanted: str | None = None) -> int:
+    """Find the column that says which sensor a row is of; DataError or UsageError if in doubt."""
+    option, names = "--sensor-column", table.names
+    if wanted is not None:
+        return find_column(table, wanted.strip(), option)
+    if names is None:
+        raise DataError(
+            f"{table.name}: has no header; say which column labels the sensor, as in {option} 1, or give one file "
+            "a sensor"
+        )
+    sure, perhaps = sensor_columns(table)
+    found = sure or perhaps
+    if len(found) > 1:
+        raise DataError(
+            f"{table.name}: the sensor could be {_listed(names, found, ' or ')}; say which with {option}"
+        )
+    if not found:
+        raise DataError(
+            f"{table.name}: no column that labels the sensor, such as sensor, serial, device or id; say which with "
+            f"{option} (there are {_listed(names, range(len(names)))}), or give one file a sensor"
+        )
+    return found[0]
+
+
+def _nameless(table: Table, sensor: int | None) -> Triple:
     width = len(table.numeric)
-    if width == 3:
-        return 0, 1, 2
+    left = [k for k in range(width) if k != sensor]
+    if len(left) == 3:
+        return left[0], left[1], left[2]
     if width < 3:
         raise DataError(f"{table.name}: has {_plural(width)} where three (x, y, z) were expected")
     raise DataError(
@@ -117,8 +154,9 @@ def _only_family(table: Table, roles: Roles) -> Triple:
     return next(iter(roles.families.values()))
 
 
-def _only_numeric(table: Table, names: Sequence[str], roles: Roles) -> Triple:
-    known = {*(roles.reference or ()), roles.count, roles.temperature, roles.label, *roles.other}
+def _only_numeric(table: Table, names: Sequence[str], roles: Roles, sensor: int | None) -> Triple:
+    known = {*(roles.reference or ()), roles.count, roles.temperature, roles.label, sensor}
+    known.update(roles.other, roles.sensors)
     known.update(column for triple in roles.scatter.values() for column in triple)
     left = [k for k in range(len(names)) if k not in known]
     if len(left) > 3:
@@ -133,28 +171,31 @@ def _only_numeric(table: Table, names: Sequence[str], roles: Roles) -> Triple:
     )
 
 
-def _with_extras(table: Table, output: Triple, roles: Roles, note: tuple[str, ...]) -> Columns:
-    """Add the optional columns that are not themselves the output."""
+def _with_extras(
+    table: Table, output: Triple, roles: Roles, note: tuple[str, ...], sensor: int | None
+) -> Columns:
+    """Add the optional columns that are not themselves the output or the label of the sensor."""
     names = table.names
 
     def free(column: int | None) -> int | None:
-        return None if column in output else column
+        return None if column in (*output, sensor) else column
 
     def free_triple(triple: Triple | None) -> Triple | None:
-        return None if triple is None or set(triple) & set(output) else triple
+        return None if triple is None or set(triple) & {*output, sensor} else triple
 
     shown = [str(k + 1) if names is None or not names[k] else names[k] for k in output]
     scatter = _scatter_of(names, output, roles)
     chosen = Columns(
         output,
         (shown[0], shown[1], shown[2]),
+        sensor,
         free(roles.label),
         free(roles.count),
         free_triple(scatter),
         free_triple(roles.reference),
         free(roles.temperature),
     )
-    used = [k for k in (chosen.label, *chosen.extras) if k is not None]
+    used = [k for k in (sensor, chosen.label, *chosen.extras) if k is not None]
     if names is not None and used:
         note = (*note, f"column{'s' * (len(used) > 1)} {_listed(names, used)} found")
     return replace(chosen, notes=(*note, *roles.partial))
@@ -168,8 +209,8 @@ def _scatter_of(names: Sequence[str] | None, output: Triple, roles: Roles) -> Tr
     return roles.scatter.get(family, roles.scatter.get(""))
 
 
-def _listed(names: Sequence[str], columns: Sequence[int]) -> str:
-    listed = ", ".join(f'"{names[k]}"' for k in columns[:20])
+def _listed(names: Sequence[str], columns: Sequence[int], between: str = ", ") -> str:
+    listed = between.join(f'"{names[k]}"' for k in columns[:20])
     return listed + (f" and {len(columns) - 20} more" if len(columns) > 20 else "")
 
 

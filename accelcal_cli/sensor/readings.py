@@ -128,7 +128,7 @@ def read_readings(
     try:
         collector = Collector(table.name, choose(table, columns))
         for rows in table.blocks(collector.columns.selection()):
-            _check_rows(table, collector.columns, rows)
+            check_rows(table, collector.columns, rows)
             collector.add(rows)
         extras = collector.finish()
         return Readings._of(collector, extras, table.sha256, table.where)
@@ -136,7 +136,7 @@ def read_readings(
         table.close()
 
 
-def _check_rows(table: Table, columns: Columns, rows: Rows) -> None:
+def check_rows(table: Table, columns: Columns, rows: Rows) -> None:
     """Refuse counts that are no counts and standard deviations below zero."""
     at = 3
     if columns.count is not None:

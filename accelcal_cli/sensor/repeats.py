@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +12,21 @@ from accelcal_cli.errors import DataError
 
 MOST_LABELS = 1_000_000
 Floats = NDArray[np.float64]
+Label = TypeVar("Label", bound=Hashable)
 
 
-class LabelledMeans:
+class LabelledMeans(Generic[Label]):
     """Weighted mean and scatter of the rows of each label (Welford's update, a block at a time).
 
     A row may itself be a mean of `weight` raw readings with standard deviation `spread`; its raw readings
     then count as if they had been rows. Memory grows with the labels, never with the rows.
     """
 
-    def __init__(self, source: str, width: int) -> None:
+    def __init__(self, source: str, width: int, most: int | None = None) -> None:
         """Average rows of `width` numbers; the first three are the sensor output."""
         self.source = source
-        self.index: dict[str, int] = {}
+        self.most = MOST_LABELS if most is None else most
+        self.index: dict[Label, int] = {}
         self.rows = np.zeros(0)  # (J,) table rows of each label
         self.weight = np.zeros(0)  # (J,) raw readings of each label
         self.mean = np.zeros((0, width))  # (J, width)
@@ -33,7 +36,11 @@ class LabelledMeans:
         self.spreads = False
 
     def add(
-        self, labels: Sequence[str], rows: Floats, weight: Floats | None = None, spread: Floats | None = None
+        self,
+        labels: Sequence[Label],
+        rows: Floats,
+        weight: Floats | None = None,
+        spread: Floats | None = None,
     ) -> None:
         """Add rows (B, width), with weights (B,) and standard deviations (B, 3) in sensor units if known."""
         index = self.index
@@ -67,8 +74,8 @@ class LabelledMeans:
         self.weight = total
 
     def _grow(self, size: int) -> None:
-        if size > MOST_LABELS:
-            raise DataError(f"{self.source}: more than {MOST_LABELS:,} different position labels")
+        if size > self.most:
+            raise DataError(f"{self.source}: more than {self.most:,} different position labels")
         more = size - len(self.rows)
         if more:
             self.rows, self.weight = (np.append(old, np.zeros(more)) for old in (self.rows, self.weight))
