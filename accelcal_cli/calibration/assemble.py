@@ -18,6 +18,7 @@ from accelcal_cli.calibration.robust import loss_weight, robust_variance
 from accelcal_cli.calibration.search import NO_NOISE, Solution, lower_problem, model_at
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.temperature import SLOPES, Slopes
+from accelcal_cli.calibration.verdict import FEWEST_POSES, edge_names, final_verdict, reasons_of
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import describe
 from accelcal_cli.sensor.readings import Readings
@@ -27,15 +28,9 @@ COMFORTABLE = 5.0
 """Suggested poses bring every dilution of precision to this: half of what counts as weak."""
 
 MOST_SUGGESTIONS = 8
-FEWEST_POSES = 12
-"""Suggested poses bring a poor set to at least this many: nine fit exactly and say nothing of their noise."""
-
 NOISE_BIAS = 3.0
 """Isotropic noise of standard deviation s makes scale factors too large by about 3 (s/g)^2: |f|^2 grows by 3 s^2
 on average, and the noise in the products of outputs doubles it. Measured at s/g from 0.02 to 0.1."""
-
-EDGE = 1e-6
-"""A parameter within this part of a half-width from the wall of its box is at the edge."""
 
 CURVE_POINTS = 120
 """Points kept of the convergence curve."""
@@ -58,7 +53,7 @@ def assemble(
     information = quality.information(nine, point)[0] - (0.0 if slopes is None else slopes.loss)
     seen = Observability.of(information, readings.poses)
     freedom = readings.poses - 9 - (0 if slopes is None else SLOPES)
-    edge = _at_edge(solution)
+    edge = edge_names(solution.x[0])
     centre = start.box.centre[0]
     before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
     fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
@@ -77,8 +72,8 @@ def assemble(
         gauge=settings.gauge,
         sigma=Sigma(sigma_K, sigma_D),
         dop=_dop(seen),
-        verdict=_verdict(seen, edge, freedom),
-        reasons=_reasons(seen_first, suggestions, edge, freedom),
+        verdict=final_verdict(seen.verdict, bool(edge), freedom),
+        reasons=reasons_of(seen_first, suggestions, edge, freedom),
         suggestions=suggestions,
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
@@ -239,47 +234,6 @@ def _curve(solution: Solution) -> tuple[tuple[int, float], ...]:
     keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, CURVE_POINTS))})
     counts, costs = search.trace_evaluations[solution.best][keep], search.trace[solution.best][keep]
     return tuple((int(n), float(cost)) for n, cost in zip(counts, costs, strict=True) if np.isfinite(cost))
-
-
-def _at_edge(solution: Solution) -> tuple[str, ...]:
-    """Return the parameters at a wall of the search box.
-
-    Where they are, the least cost lies outside the box. In gauge `full` the free rotation reaches the walls of
-    the off-diagonals by itself, which says nothing.
-    """
-    unknowns = solution.x.shape[1]
-    names = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: unknowns - 3]
-    edge = np.abs(solution.x[0]) >= 1.0 - EDGE
-    if unknowns == 12:
-        edge[3:9] = False
-    return tuple(n for n, at in zip((*names, "D_1", "D_2", "D_3"), edge, strict=True) if at)
-
-
-def _verdict(seen: Observability, edge: tuple[str, ...], freedom: int) -> str:
-    """Return the verdict of the poses, lowered where the search or the count of poses does not bear it out."""
-    if edge:
-        return "undetermined"
-    return "weak" if freedom == 0 and seen.verdict == "good" else seen.verdict
-
-
-def _reasons(
-    seen: Observability, suggestions: tuple[str, ...], edge: tuple[str, ...], freedom: int
-) -> tuple[str, ...]:
-    lines = list(quality.in_words(seen, suggestions))
-    if freedom < 0:
-        lines.insert(
-            0, f"{9 + freedom} poses are fewer than the nine parameters; take at least {FEWEST_POSES}."
-        )
-    if freedom == 0:
-        lines.append(
-            f"Nine poses fit exactly and say nothing of their noise: no sigma. Take at least {FEWEST_POSES}."
-        )
-    if edge:
-        lines.append(
-            f"The least cost lies outside the search box, beyond {', '.join(edge)}: "
-            "widen the box or state the nominal sensor (--config, keys box and nominal)."
-        )
-    return tuple(lines)
 
 
 def _notes(

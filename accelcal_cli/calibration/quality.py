@@ -42,9 +42,9 @@ Verdict = Literal["good", "weak", "undetermined"]
 
 
 def design(u: Float) -> Float:
-    """Return d e / d parameters, shape (J, 9), for unit directions u of the specific force, shape (J, 3)."""
-    pairs = [u[:, i] * u[:, j] for i, j in ROWS_COLUMNS[:6]]
-    return np.stack([*(-p for p in pairs), u[:, 0], u[:, 1], u[:, 2]], axis=1)
+    """Return d e / d parameters, shape (..., J, 9), for unit directions u of the specific force, shape (..., J, 3)."""
+    pairs = [u[..., i] * u[..., j] for i, j in ROWS_COLUMNS[:6]]
+    return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
 
 
 def verdict_of(worst: float, rank: int) -> Verdict:

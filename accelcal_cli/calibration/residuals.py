@@ -10,7 +10,7 @@ import numpy as np
 from accelcal_cli.calibration.quality import design
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Float, Int
+from accelcal_cli.streams import Bool, Float, Int
 
 KEPT = 1000
 """Poses whose residuals a result keeps one by one; of more, the worst KEPT_WORST."""
@@ -139,29 +139,61 @@ def _judge(
     Studentised residuals need freedom >= 2; `scaled` is sqrt(w) e and `weighted_sum` its squares over all poses.
     """
     size = np.linalg.norm(f, axis=1)
-    rows = design(f / size[:, None])
-    leverage = np.minimum(w * np.einsum("jp,pq,jq->j", rows, cofactor, rows), 1.0)
-    # A pose that the fit follows completely (leverage 1) has no error of its own to judge it by.
-    room = np.where(leverage < 1.0 - 1e-9, 1.0 - leverage, np.nan)
-    studentised = np.full(len(pose), np.nan)
-    if freedom >= 2:
-        others = np.maximum(weighted_sum - scaled**2 / room, 0.0) / (freedom - 1)
-        studentised = -scaled / np.sqrt(np.where(others > 0, others, np.nan) * room)
+    leverage = leverages(design(f / size[:, None]), w, cofactor)
+    room = room_of(leverage)
+    studentised = studentise(scaled, room, weighted_sum, freedom)
     before = length_error(e_before, g)
     return PoseResiduals(pose, size - g, before, f, leverage, studentised, (size - g) / room)
+
+
+def leverages(rows: Float, w: Float, cofactor: Float) -> Float:
+    """Return the part of each pose's own residual that the fit absorbs, shape (..., J).
+
+    Args:
+        rows: their design, shape (..., J, 9); w: their weights, shape (..., J).
+        cofactor: (J^T W J)^-1, shape (..., 9, 9).
+    """
+    leverage: Float = np.minimum(w * np.sum((rows @ cofactor) * rows, axis=-1), 1.0)
+    return leverage
+
+
+def room_of(leverage: Float) -> Float:
+    """Return 1 - leverage; NaN for a pose that the fit follows completely: it has no error to judge it by."""
+    return np.where(leverage < 1.0 - 1e-9, 1.0 - leverage, np.nan)
+
+
+def studentise(scaled: Float, room: Float, total: Float | float, freedom: Int | int) -> Float:
+    """Return residuals over their standard deviation from the other poses, shape (..., J), NaN below 2 of freedom.
+
+    Args:
+        scaled: sqrt(w) e, m/s^2, and `room`, both of shape (..., J).
+        total: the sum of all their squares; freedom: J - 9; both scalars or of shape (..., 1).
+    """
+    others = np.maximum(total - scaled**2 / room, 0.0) / np.maximum(freedom - 1, 1)
+    deviation = np.sqrt(np.where((others > 0) & (np.asarray(freedom) >= 2), others, np.nan) * room)
+    found: Float = -scaled / deviation
+    return found
 
 
 def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:
     """Return the pose numbers whose studentised residual is beyond chance (Student t, Bonferroni)."""
     if freedom < 2:
         return residuals.pose[:0]
-    size = np.abs(residuals.studentised)
+    named: Int = residuals.pose[beyond_chance(np.abs(residuals.studentised), poses, freedom)]
+    return named
+
+
+def beyond_chance(size: Float, poses: Int | int, freedom: Int | int) -> Bool:
+    """Return which studentised residuals are so large that none of a sensor's would be by chance, same shape.
+
+    Args:
+        size: absolute values, NaN for none; poses, freedom: of the sensor, broadcast against them.
+    """
     # Student's t has heavier tails than any bound of 3, so most fits need no quantile and no scipy.
-    suspect = size > 3.0
+    suspect: Bool = np.asarray(size > 3.0)
     if not suspect.any():
-        return residuals.pose[:0]
+        return suspect
     from scipy.special import stdtr
 
-    chance = 2.0 * poses * stdtr(freedom - 1, -size)
-    named: Int = residuals.pose[suspect & (chance < OUTLIER_LEVEL)]
-    return named
+    degrees = np.maximum(np.asarray(freedom) - 1.0, 1.0)
+    return np.asarray(suspect & (2.0 * poses * stdtr(degrees, -size) < OUTLIER_LEVEL))

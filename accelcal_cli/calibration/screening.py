@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.calibration.assemble import EDGE
 from accelcal_cli.calibration.quality import Observability, information
 from accelcal_cli.calibration.residuals import modulus_errors, square_error
 from accelcal_cli.calibration.search import model_at
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.verdict import at_edge
 from accelcal_cli.calibration.weighting import fitted, shared_weights
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
@@ -43,11 +43,10 @@ def screen(readings: Readings, g: float) -> Screened:
     cost = float(problem.cost(x[:, None])[0, 0])
     s = np.sqrt(cost / (4.0 * g**2) / freedom) if freedom > 0 else np.nan
     square = sum(square_error(e, g) for _, e, _ in modulus_errors(readings, model, g))
-    at_edge = bool((np.abs(x) >= 1.0 - EDGE).any())
     return Screened(
         model,
         float(np.sqrt(square / readings.poses)),
         float(s),
         seen.worst,
-        "undetermined" if at_edge else seen.verdict,
+        "undetermined" if at_edge(x).any() else seen.verdict,
     )
