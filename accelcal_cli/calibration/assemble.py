@@ -164,20 +164,27 @@ def nominal_before(scale: float, D: Float, settings: Settings) -> tuple[str, Err
         scale: mean scale factor, output units per m/s^2; D: bias, output units, shape (3,).
         settings: may state a nominal sensor.
     """
+    k, bias, words = taken_for(np.array([scale]), D[None], settings)
+    return words[0], ErrorModel(np.diag(k[0]), bias[0])
+
+
+def taken_for(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:
+    """Return scale factors and biases, shape (R, 3), and words of what readings of R sensors are taken for.
+
+    See `nominal_before`; scale has the shape (R,), D (R, 3).
+    """
     if settings.nominal is not None:
-        return "the stated nominal sensor", ErrorModel(
-            np.diag(settings.nominal.scale), np.array(settings.nominal.bias)
-        )
-    scale = _round(scale)
-    if 0.8 < scale < 1.25:  # specific force already, in m/s^2 or in g
-        return "the readings as they are", ErrorModel(np.eye(3), np.zeros(3))
+        k, bias = (np.broadcast_to(v, D.shape) for v in (settings.nominal.scale, settings.nominal.bias))
+        return k, bias, ["the stated nominal sensor"] * len(D)
+    # A nominal scale factor carries no more than three significant digits.
+    rounded = np.array([float(f"{value:.3g}") for value in scale.tolist()])
+    force = (rounded > 0.8) & (rounded < 1.25)  # specific force already, in m/s^2 or in g
     words = "one scale factor for all axes and the estimated bias, no misalignment"
-    return words, ErrorModel(scale * np.eye(3), D)
-
-
-def _round(value: float) -> float:
-    """Return a value to three significant digits: a nominal scale factor carries no more."""
-    return float(f"{value:.3g}")
+    return (
+        np.repeat(np.where(force, 1.0, rounded)[:, None], 3, axis=1),
+        np.where(force[:, None], 0.0, D),
+        ["the readings as they are" if f else words for f in force],
+    )
 
 
 def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple[float | None, float | None]:

@@ -12,11 +12,12 @@ probability `EQUAL`, else a ratio that is spread over a factor of e^SPREAD eithe
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.streams import Float
+from accelcal_cli.streams import Float, Int
 
 EQUAL, SPREAD = 0.85, 1.0
 """Unchanged sensors are called changed at the 5 % level in 3.8 to 5.3 % of all cases at equal noise, whatever the two
@@ -24,6 +25,9 @@ sets of poses (benchmarks/verify_level.py). With less weight on equal noise 12 p
 
 STEPS = np.linspace(-6.0, 6.0, 61)
 """Where ratios are looked at, in standard deviations of the logarithm of the estimated one."""
+
+MOST_TERMS = 2000
+"""Degrees of freedom up to which Student's distribution is summed term by term; scipy, slow to load, takes the rest."""
 
 
 @dataclass(frozen=True)
@@ -109,3 +113,55 @@ def holm(chances: Float) -> Float:
     adjusted = np.empty_like(chances)
     adjusted[order] = np.minimum(np.maximum.accumulate(chances[order] * factors), 1.0)
     return adjusted
+
+
+def student_chance(t: Float, freedom: Int) -> Float:
+    """Return the chance of an absolute value of t > 0 or more under Student's distribution, shape (n,).
+
+    The finite sums in powers of cos^2 a, tan a = t / sqrt(n), that hold for whole degrees of freedom [abramowitz1964]
+    eq. 26.7.3 and 26.7.4.
+    """
+    chance = np.empty(len(t))
+    for n in np.unique(freedom):
+        own = freedom == n
+        chance[own] = _student(t[own], int(n))
+    return chance
+
+
+def _student(t: Float, n: int) -> Float:
+    if n > MOST_TERMS:
+        from scipy.special import stdtr
+
+        return np.asarray(2.0 * stdtr(n, -t))
+    square = n / (n + t * t)
+    odd = n % 2
+    term, total = np.ones_like(t), np.zeros_like(t)
+    for k in range(odd + 1, n, 2):
+        total += term
+        term = term * square * (k / (k + 1.0))
+    sine = t / np.sqrt(n + t * t)
+    if odd:
+        return np.asarray(1.0 - (np.arctan(t / np.sqrt(n)) + sine * np.sqrt(square) * total) * (2.0 / np.pi))
+    return 1.0 - sine * total
+
+
+def chi_square_chance(x: Float, freedom: Int) -> Float:
+    """Return the chance of x > 0 or more under the chi-square distribution, shape (n,), for whole degrees of freedom.
+
+    The finite sums of [abramowitz1964] eq. 26.4.4 and 26.4.5.
+    """
+    return np.array([_chi_square(float(a), int(n)) for a, n in zip(x, freedom, strict=True)])
+
+
+def _chi_square(x: float, n: int) -> float:
+    if n > MOST_TERMS or x > 1000.0:
+        from scipy.special import chdtrc
+
+        return float(chdtrc(n, x))
+    half, odd = 0.5 * x, n % 2
+    total = math.erfc(math.sqrt(half)) if odd else 0.0
+    term = math.exp(-half) * (math.sqrt(half / math.pi) * 2.0 if odd else 1.0)
+    for k in range(n // 2):
+        total += term
+        term *= half / (k + 1.0 + 0.5 * odd)
+    return total

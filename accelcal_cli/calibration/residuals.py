@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from accelcal_cli.calibration.chances import student_chance
 from accelcal_cli.calibration.quality import design
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
@@ -179,21 +180,21 @@ def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:
     """Return the pose numbers whose studentised residual is beyond chance (Student t, Bonferroni)."""
     if freedom < 2:
         return residuals.pose[:0]
-    named: Int = residuals.pose[beyond_chance(np.abs(residuals.studentised), poses, freedom)]
+    size = np.abs(residuals.studentised)
+    beyond = beyond_chance(size, np.full(size.shape, poses), np.full(size.shape, freedom))
+    named: Int = residuals.pose[beyond]
     return named
 
 
-def beyond_chance(size: Float, poses: Int | int, freedom: Int | int) -> Bool:
+def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
     """Return which studentised residuals are so large that none of a sensor's would be by chance, same shape.
 
     Args:
-        size: absolute values, NaN for none; poses, freedom: of the sensor, broadcast against them.
+        size: absolute values, NaN for none; poses, freedom: of their sensor, same shape.
     """
-    # Student's t has heavier tails than any bound of 3, so most fits need no quantile and no scipy.
-    suspect: Bool = np.asarray(size > 3.0)
-    if not suspect.any():
-        return suspect
-    from scipy.special import stdtr
-
-    degrees = np.maximum(np.asarray(freedom) - 1.0, 1.0)
-    return np.asarray(suspect & (2.0 * poses * stdtr(degrees, -size) < OUTLIER_LEVEL))
+    found: Bool = np.asarray(size > 3.0)  # Student's t has heavier tails than any bound of 3.
+    suspect = np.flatnonzero(found & (freedom >= 2))
+    chance = poses.flat[suspect] * student_chance(size.flat[suspect], freedom.flat[suspect] - 1)
+    found[...] = False
+    found.flat[suspect[chance < OUTLIER_LEVEL]] = True
+    return found

@@ -19,6 +19,7 @@ from accelcal_cli.cli import (
     compare,
     detect,
     export,
+    fleet,
     navigate,
     optimizers,
     plan,
@@ -66,6 +67,7 @@ app.command("apply")(apply.command)
 app.command("verify")(verify.command)
 app.command("capture")(capture.command)
 app.command("plan")(plan.command)
+app.command("fleet")(fleet.command)
 app.command("report")(report.command)
 app.command("export")(export.command)
 app.command("benchmark")(benchmark.command)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,9 @@ from accelcal_cli.cli import options
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from accelcal_cli.sensor.model import ErrorModel
     from accelcal_cli.sensor.simulation import Sensor, Simulated
     from accelcal_cli.streams import Float
 
@@ -31,6 +34,9 @@ def command(
         typer.Option(help="Noise of one sample and axis, one sigma, m/s^2.", show_default="the sensor's"),
     ] = None,
     samples: Annotated[int, typer.Option(help="Samples of each pose.", min=1)] = 1,
+    sensors: Annotated[
+        int | None, typer.Option(help="Sensors of this type, drawn with its spread, for `fleet`.", min=1)
+    ] = None,
     attitude: Annotated[bool, typer.Option(help="Add the true specific force of each row.")] = False,
     raw: Annotated[
         bool, typer.Option("--raw", help="Simulate a raw log: poses held, moves between.")
@@ -55,7 +61,8 @@ def command(
 ) -> None:
     """Simulate static readings of an accelerometer with known errors.
 
-    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them. With --raw
+    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them. With --sensors
+    they carry the label of their sensor, and `fleet` calibrates each. With --raw
     they are a log of time, acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
     from accelcal_cli.config import dump, load_sensor
@@ -64,14 +71,19 @@ def command(
     from accelcal_cli.registry import build
     from accelcal_cli.sensor.motion import Handling, handled
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, simulate
+    from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, simulate, simulate_fleet
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
     from accelcal_cli.streams import Streams
 
     if noise is not None and not 0 <= noise <= LARGEST_NOISE:
         raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
-    if positions * samples > MOST_SAMPLES:
-        raise UsageError(f"--positions {positions} with --samples {samples}: at most {MOST_SAMPLES:,} rows")
+    if raw and sensors is not None:
+        raise UsageError("--sensors: does not go with --raw")
+    if positions * samples * (sensors or 1) > MOST_SAMPLES:
+        many = "" if sensors is None else f" and --sensors {sensors}"
+        raise UsageError(
+            f"--positions {positions} with --samples {samples}{many}: at most {MOST_SAMPLES:,} rows"
+        )
     if output == truth:
         raise UsageError(f'--truth "{truth}": expected another file than --output')
     stated = {"rate": rate, "hold": hold, "move": move, "tremor": tremor}
@@ -89,7 +101,11 @@ def command(
         if raw:
             log = handled(device, u, local_g, build(Handling, handling, "simulate --raw"), sigma, seed)
             record["holds"] = [list(rows) for rows in write_log(log, gyro, file)]
+        elif sensors is not None:
+            drawn = simulate_fleet(device, sensors, u, local_g, samples, sigma, seed)
+            record["sensors"] = _write_fleet(file, drawn, len(str(sensors)), samples > 1, attitude)
         else:
+            _header(file, [], samples > 1, attitude)
             _write(file, simulate(device, u, local_g, samples, sigma, seed), samples > 1, attitude)
     sys.stdout.flush()
     if truth is not None:
@@ -104,15 +120,31 @@ def _check_raw(raw: bool, stated: list[str], samples: int, attitude: bool) -> No
         raise UsageError(f"{'--samples' if samples > 1 else '--attitude'}: does not go with --raw")
 
 
-def _write(file, readings: Simulated, labelled: bool, attitude: bool) -> None:  # type: ignore[no-untyped-def]
-    """Write the rows with the shortest digits that read back to the same numbers."""
-    names = ["pose"] * labelled + ["Nx", "Ny", "Nz"] + ["fx", "fy", "fz"] * attitude
+def _header(file: IO[str], first: list[str], labelled: bool, attitude: bool) -> None:
+    names = first + ["pose"] * labelled + ["Nx", "Ny", "Nz"] + ["fx", "fy", "fz"] * attitude
     file.write(",".join(names) + "\n")
+
+
+def _write_fleet(
+    file: IO[str], drawn: Iterable[tuple[ErrorModel, Simulated]], digits: int, labelled: bool, attitude: bool
+) -> dict[str, object]:
+    """Write the rows of many sensors; return the true parameters by sensor."""
+    truth: dict[str, object] = {}
+    _header(file, ["sensor"], labelled, attitude)
+    for number, (model, readings) in enumerate(drawn, 1):
+        label = f"S{number:0{digits}d}"
+        truth[label] = {"K_a": model.K.tolist(), "D_a": model.D.tolist()}
+        _write(file, readings, labelled, attitude, f"{label},")
+    return truth
+
+
+def _write(file: IO[str], readings: Simulated, labelled: bool, attitude: bool, first: str = "") -> None:
+    """Write the rows with the shortest digits that read back to the same numbers, each after the text `first`."""
     for pose, output, force in zip(readings.pose, readings.output, readings.force, strict=True):
         cells = [str(pose)] * labelled + [repr(float(v)) for v in output]
         if attitude:
             cells += [repr(float(v)) for v in force]
-        file.write(",".join(cells) + "\n")
+        file.write(f"{first}{','.join(cells)}\n")
 
 
 def _truth(device: Sensor, g: float, noise: float, u: Float) -> dict[str, object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -63,10 +64,49 @@ def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
             Path(temporary).unlink(missing_ok=True)
 
 
-def _mode(target: Path) -> int:
+def check_folder(path: str) -> None:
+    """Raise OutputError when `path` cannot become a folder of ours, before any work is done for it."""
+    target = Path(path)
+    if target.is_dir():
+        if any(target.iterdir()):
+            raise OutputError(f"{path}: holds files already; expected a new or an empty folder")
+    elif target.exists():
+        raise OutputError(f"{path}: is a file; expected a new or an empty folder")
+    if not target.parent.is_dir():
+        raise OutputError(f"{path}: no such folder: {target.parent}")
+    if not os.access(target.parent, os.W_OK):
+        raise OutputError(f"{path}: permission denied")
+
+
+@contextmanager
+def whole_folder(path: str) -> Iterator[Path]:
+    """Give a folder to write to that appears under its name only when all of it was written.
+
+    Raises:
+        OutputError: it cannot be written, or holds something already; nothing is left behind.
+    """
+    check_folder(path)
+    target = Path(path)
+    temporary = ""
+    try:
+        temporary = tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        yield Path(temporary)
+        os.chmod(temporary, _mode(target, 0o777))
+        if target.is_dir():
+            target.rmdir()
+        os.replace(temporary, target)
+        temporary = ""
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+    finally:
+        if temporary:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _mode(target: Path, new: int = 0o666) -> int:
     """Return the mode of the file that is replaced, or what the umask gives a new one."""
     if target.exists():
         return target.stat().st_mode & 0o7777
     mask = os.umask(0)
     os.umask(mask)
-    return 0o666 & ~mask
+    return new & ~mask

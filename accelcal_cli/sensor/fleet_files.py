@@ -91,6 +91,8 @@ class _Gathering:
         columns = choose(table, wanted, column)
         means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
         for rows in table.blocks(columns.selection()):
+            if not len(rows.numbers):
+                continue
             check_rows(table, columns, rows)
             codes = self._codes(rows.texts[0] if name is None else _only(table, columns, rows, name))
             if means is None:

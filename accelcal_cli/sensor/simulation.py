@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +101,22 @@ def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, see
         noise: one sigma of one sample and axis, m/s^2.
         seed: of the noise.
     """
+    return _readings(sensor.model, u, g, samples, noise, Streams(seed, [0], purpose=NOISE_PURPOSE))
+
+
+def simulate_fleet(
+    sensor: Sensor, sensors: int, u: Float, g: float, samples: int, noise: float, seed: int
+) -> Iterator[tuple[ErrorModel, Simulated]]:
+    """Yield sensors of one type, drawn with its spread, and what each reads at rest; see `simulate` and `draw`."""
+    drawn = draw(sensor, range(sensors), seed)
+    for run in range(sensors):
+        model = ErrorModel(drawn.K[run], drawn.D[run])
+        yield model, _readings(model, u, g, samples, noise, Streams(seed, [run], purpose=NOISE_PURPOSE))
+
+
+def _readings(
+    model: ErrorModel, u: Float, g: float, samples: int, noise: float, random: Streams
+) -> Simulated:
     force = np.repeat(g * u, samples, axis=0)
-    disturbance = Streams(seed, [0], purpose=NOISE_PURPOSE).normal(len(force), 3)[0]
-    output = sensor.model.output(force + noise * disturbance)
+    output = model.output(force + noise * random.normal(len(force), 3)[0])
     return Simulated(np.repeat(np.arange(1, len(u) + 1), samples), output, force)

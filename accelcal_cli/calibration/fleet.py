@@ -1,0 +1,326 @@
+"""Thousands of sensors at once: everything that `calibrate` does for one, for batches of them.
+
+Each sensor goes its own road in the same company of arrays: its box, its start and its steps are those that it would
+have alone, with Levenberg-Marquardt as the optimizer. Where the poses determine the ellipsoid, the start is the least
+cost itself (calibration.ellipsoid), and the solver confirms it with a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.assemble import assemble, taken_for
+from accelcal_cli.calibration.compress import compress_each
+from accelcal_cli.calibration.ellipsoid import least_squares
+from accelcal_cli.calibration.lotters import Loetters
+from accelcal_cli.calibration.nominal import Start, search_box
+from accelcal_cli.calibration.quality import Observabilities
+from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.search import Solution, polish
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.verdict import at_edge, edge_names, final_verdict, reasons_of
+from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.optimizers.minimize import Run, minimize
+from accelcal_cli.sensor.fleet import Batch, FleetReadings
+from accelcal_cli.sensor.model import to_gauge
+from accelcal_cli.streams import Bool, Float, Int
+
+FAILED = "failed"
+"""Verdict on a sensor whose readings say nothing: a single pose, or all of them equal."""
+
+NAMED = 3
+"""Outlying poses of a sensor that are named one by one."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """R calibrated sensors; units as in `Calibration`, NaN for a sensor that failed.
+
+    Attributes:
+        number: the sensors' numbers among the readings, shape (R,); poses: J of each.
+        K_a, D_a: in the gauge of the settings, shapes (R, 3, 3) and (R, 3); sigma_k, sigma_d: their one-sigma.
+        lower: K_a in gauge `lower`, shape (R, 3, 3).
+        dop: dilution of precision of the nine parameters, shape (R, 9).
+        cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
+        verdict: good, weak, undetermined or failed, shape (R,); reason: why it is not good, in sentences.
+        outlying: the poses beyond chance, in words.
+    """
+
+    number: Int
+    poses: Int
+    K_a: Float
+    D_a: Float
+    sigma_k: Float
+    sigma_d: Float
+    lower: Float
+    dop: Float
+    cost: Float
+    s: Float
+    rms: Float
+    rms_before: Float
+    verdict: np.ndarray
+    reason: np.ndarray
+    outlying: np.ndarray
+
+    @property
+    def determined(self) -> Bool:
+        """Which sensors are good or weak, shape (R,)."""
+        return np.asarray((self.verdict == "good") | (self.verdict == "weak"))
+
+
+def check_settings(settings: Settings) -> None:
+    """Refuse what is not done for a fleet.
+
+    Raises:
+        ConfigError: a robust loss, weights "auto", known attitudes, gauge `full`, or several runs.
+    """
+    for key, allowed in {
+        "optimizer": ("levenberg-marquardt",),
+        "robust": ("none",),
+        "weights": ("none", "n", "sd"),
+        "attitudes": ("unknown",),
+        "gauge": ("lower", "upper", "symmetric"),
+        "runs": (1,),
+        "polish": (True,),
+    }.items():
+        value = getattr(settings, key)
+        if value not in allowed:
+            words = ", ".join(map(str, allowed))
+            raise ConfigError(
+                f"{key}: {value}: a fleet goes with {words} only; calibrate this sensor by itself"
+            )
+
+
+def calibrate_fleet(
+    readings: FleetReadings,
+    settings: Settings,
+    keep: Callable[[int, Calibration], None] | None = None,
+) -> Fleet:
+    """Calibrate every sensor of a fleet.
+
+    Args:
+        readings: static poses of R sensors.
+        settings: as of one calibration with `levenberg-marquardt`; see `check_settings`.
+        keep: takes the number and the whole record of each sensor that did not fail, one by one.
+
+    Raises:
+        ConfigError: settings that are not for a fleet.
+        DataError: weights that a sensor's readings do not give.
+    """
+    check_settings(settings)
+    parts = []
+    for batch in readings.batches():
+        useful = (batch.output.max(axis=1) > batch.output.min(axis=1)).any(axis=1)
+        if not useful.all():
+            parts.append(_failed(batch.take(np.flatnonzero(~useful))))
+            batch = batch.take(np.flatnonzero(useful))
+        if len(batch.sensors):
+            parts.append(_calibrated(readings, batch, settings, keep))
+    order = np.argsort(np.concatenate([part.number for part in parts]))
+    return Fleet(
+        **{f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(Fleet)}
+    )
+
+
+def _failed(batch: Batch) -> Fleet:
+    """Return the part of sensors without any information."""
+
+    def nan(*shape: int) -> Float:
+        return np.full((len(batch.sensors), *shape), np.nan)
+
+    words = ["only one pose" if n == 1 else f"all {n} poses are equal" for n in batch.count]
+    return Fleet(
+        number=batch.sensors,
+        poses=batch.count,
+        K_a=nan(3, 3),
+        D_a=nan(3),
+        sigma_k=nan(3, 3),
+        sigma_d=nan(3),
+        lower=nan(3, 3),
+        dop=nan(9),
+        cost=nan(),
+        s=nan(),
+        rms=nan(),
+        rms_before=nan(),
+        verdict=np.full(len(words), FAILED, dtype=object),
+        reason=np.array([f"Nothing to calibrate: {word}." for word in words], dtype=object),
+        outlying=np.full(len(words), "", dtype=object),
+    )
+
+
+def _calibrated(
+    readings: FleetReadings,
+    batch: Batch,
+    settings: Settings,
+    keep: Callable[[int, Calibration], None] | None,
+) -> Fleet:
+    """Return the part of a batch whose readings differ."""
+    g = settings.g
+    weights = _weights(readings, batch, settings)
+    triangle = compress_each(batch.output, weights, batch.count)
+    start = search_box(triangle, settings)
+    problem = Loetters(triangle, g, start.box)
+    run = _solve(problem, start, settings)
+    lower, D = problem.parameters(run.x)
+    information = quality.information(problem, run.x)
+    seen = Observabilities.of(information, batch.count)
+    freedom = batch.count - 9
+    variance = np.where(freedom > 0, run.cost / (4.0 * g**2) / np.maximum(freedom, 1), np.nan)
+    finite = np.isfinite(seen.dop[:, :, None] * seen.dop[:, None, :])
+    covariance = np.where(finite, variance[:, None, None] * seen.cofactor, np.nan)
+    K = to_gauge(lower, settings.gauge)
+    verdict = [
+        final_verdict(word, bool(at_edge(x).any()), int(left))
+        for word, x, left in zip(seen.verdicts, run.x, freedom, strict=True)
+    ]
+    rms, rms_before, outlying = _residuals(readings, batch, lower, D, start, seen, weights, settings)
+    part = Fleet(
+        batch.sensors,
+        batch.count,
+        K,
+        D,
+        *quality.propagate(K, lower, covariance, settings.gauge, g),
+        lower,
+        seen.dop,
+        run.cost,
+        np.sqrt(variance),
+        rms,
+        rms_before,
+        np.array(verdict, dtype=object),
+        _reasons(problem, start, run, seen, batch, verdict),
+        outlying,
+    )
+    if keep is not None:
+        for at in range(len(batch.sensors)):
+            own = None if weights is None else weights[at, : batch.count[at]]
+            solution = _solution(problem, run, at)
+            index = np.array([at])
+            keep(
+                int(batch.sensors[at]),
+                assemble(readings.one(batch, at), settings, start.take(index), solution, own),
+            )
+    return part
+
+
+def _solve(problem: Loetters, start: Start, settings: Settings) -> Run:
+    """Return the polished runs, one a sensor: from the least cost where readings give it, else from a search."""
+    x = problem.coordinates(*_least_cost(problem))
+    inside = np.isfinite(x).all(axis=1) & (np.abs(np.nan_to_num(x)) < 1.0).all(axis=1)
+    closed = np.array([source != "sphere" for source in start.sources])
+    searched = np.flatnonzero(~(inside & closed))
+    if len(searched):
+        x[searched] = minimize(
+            _of(problem, searched),
+            settings.build_optimizer(),
+            runs=[0] * len(searched),  # each of them would be run 0 of a calibration of its own
+            seed=settings.seed,
+            trace=False,
+        ).x
+    return polish(problem, np.where(np.isfinite(x), x, 0.0))
+
+
+def _least_cost(problem: Loetters) -> tuple[Float, Float]:
+    triangle = problem.triangle
+    K, d = least_squares(triangle)
+    return K * triangle.scale[:, None, None] / problem.g, d * triangle.scale[:, None] + triangle.centre
+
+
+def _of(problem: Loetters, index: Int) -> Loetters:
+    """Return the problem of the sensors at `index`, of a single sensor too."""
+    return Loetters(problem.triangle.take(index), problem.g, problem.box.take(index))
+
+
+def _solution(problem: Loetters, run: Run, at: int) -> Solution:
+    """Return what was found for one sensor as the solution of its own calibration."""
+    index = np.array([at])
+    own = Run(
+        np.zeros(1, dtype=np.int64),
+        run.x[index],
+        run.cost[index],
+        run.evaluations[index],
+        run.iterations[index],
+        (run.status[at],),
+    )
+    cost, spent = float(run.cost[at]), int(run.evaluations[at])
+    return Solution(_of(problem, index), own.x, own, 0, cost, spent, 1)
+
+
+def _weights(readings: FleetReadings, batch: Batch, settings: Settings) -> Float | None:
+    """Return the weights of the poses, mean 1 for each sensor, 0 for repetitions, shape (R, J); None for all alike."""
+    real = batch.real
+    if settings.weights == "none":
+        return None if real.all() else real.astype(float)
+    weights = np.ones(real.shape) if batch.behind is None else batch.behind
+    if settings.weights == "sd":
+        square = None if batch.scatter is None else np.mean(batch.scatter**2, axis=2)
+        weights = np.full(real.shape, np.nan) if square is None else weights / square
+    bad = (batch.behind is None) | ~(np.isfinite(weights) & (weights > 0)) & real
+    if np.any(bad):
+        at = int(np.argmax(np.broadcast_to(bad, real.shape).any(axis=1)))
+        what = {"n": "counts", "sd": "counts and standard deviations above zero"}[settings.weights]
+        raise DataError(
+            f'{readings.source}: sensor "{readings.sensors[batch.sensors[at]]}": --weights {settings.weights} needs '
+            f"{what} (columns n, sx, sy, sz), or at least two readings of every pose"
+        )
+    weights = np.where(real, weights, 0.0)
+    mean: Float = weights.sum(axis=1, keepdims=True) / batch.count[:, None]
+    return weights / mean
+
+
+def _residuals(
+    readings: FleetReadings,
+    batch: Batch,
+    K: Float,
+    D: Float,
+    start: Start,
+    seen: Observabilities,
+    weights: Float | None,
+    settings: Settings,
+) -> tuple[Float, Float, np.ndarray]:
+    """Return rms of |f| - g after and before, m/s^2, shape (R,), and each sensor's outlying poses in words."""
+    g, real, poses = settings.g, batch.real, batch.count
+    force = (batch.output - D[:, None]) @ np.linalg.inv(K).swapaxes(1, 2)
+    size = np.linalg.norm(force, axis=2)
+    centre = start.box.centre
+    scale, bias, _ = taken_for(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
+    before = np.linalg.norm((batch.output - bias[:, None]) / scale[:, None], axis=2)
+    rms, rms_before = (np.sqrt(np.sum(real * (f - g) ** 2, axis=1) / poses) for f in (size, before))
+    w = np.ones(real.shape) if weights is None else weights
+    scaled = np.sqrt(w) * (g * g - size**2) / (2.0 * g)
+    unit = force / np.where(size > 0, size, 1.0)[..., None]
+    room = room_of(leverages(quality.design(unit), w, seen.cofactor))
+    freedom = poses[:, None] - 9
+    total = np.sum(scaled**2, axis=1, keepdims=True)
+    far = np.where(real, np.abs(studentise(scaled, room, total, freedom)), np.nan)
+    outlying = beyond_chance(far, *(np.broadcast_to(a, far.shape) for a in (poses[:, None], freedom)))
+    words = np.full(len(poses), "", dtype=object)
+    for at in np.flatnonzero(outlying.any(axis=1)):
+        found = batch.pose[at, np.flatnonzero(outlying[at])]
+        more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+        words[at] = ", ".join(readings.where(int(pose)) for pose in found[:NAMED]) + more
+    return rms, rms_before, words
+
+
+def _reasons(
+    problem: Loetters, start: Start, run: Run, seen: Observabilities, batch: Batch, verdict: Sequence[str]
+) -> np.ndarray:
+    """Return why each verdict is not good, shape (R,); readings that fix no ellipsoid are seen from the sphere."""
+    words = np.full(len(verdict), "", dtype=object)
+    index = np.flatnonzero([word != "good" for word in verdict])
+    if not len(index):
+        return words
+    middle = np.zeros((len(index), problem.unknowns))
+    sphere = Observabilities.of(quality.information(_of(problem, index), middle), batch.count[index])
+    for k, at in enumerate(index):
+        first = sphere.one(k)
+        round_ = start.sources[at] == "sphere" and first.verdict == "undetermined"
+        lines = reasons_of(
+            first if round_ else seen.one(int(at)), (), edge_names(run.x[at]), int(batch.count[at]) - 9
+        )
+        words[at] = " ".join(lines)
+    return words

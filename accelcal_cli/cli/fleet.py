@@ -1,0 +1,174 @@
+"""`accelcal fleet`: readings of thousands of sensors in, a row or a result file for each out."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from accelcal_cli.cli import options
+from accelcal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from accelcal_cli.calibration.fleet import Fleet
+    from accelcal_cli.calibration.settings import Settings
+    from accelcal_cli.sensor.fleet import FleetReadings
+
+BAD_VERDICT = 1
+SUFFIXES = (".csv", ".parquet", ".json")
+NAMED = 5
+"""Sensors that a line on standard error names."""
+
+
+def command(
+    data: Annotated[
+        list[str],
+        typer.Argument(
+            help="Table of static readings with a column that labels the sensor, or one file a sensor; CSV, text or "
+            "Parquet; - is standard input."
+        ),
+    ],
+    sensor_column: Annotated[
+        str | None,
+        typer.Option(
+            help="Column that labels the sensor: name, or number from 1.", show_default="found by name"
+        ),
+    ] = None,
+    columns: options.Columns = None,
+    g: options.Gravity = None,
+    latitude: options.Latitude = None,
+    height: options.Height = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file: box, nominal, gauge, weights, g.")] = None,
+    gauge: Annotated[
+        str | None, typer.Option(help="lower, upper or symmetric.", show_default="lower")
+    ] = None,
+    weights: Annotated[
+        str | None, typer.Option(help="Weight of a pose: none, n or sd.", show_default="none")
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Exit 1 when the rms of |f| - g of a sensor is above this (m/s^2)."),
+    ] = None,
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Table of all sensors, .csv, .parquet or .json; or a folder, ending in /, for a result file of each.",
+        ),
+    ] = None,
+    format: options.Format = "table",
+    quiet: options.Quiet = False,
+) -> None:
+    """Calibrate thousands of sensors at once.
+
+    Every sensor as `calibrate --optimizer levenberg-marquardt` would by itself. Prints how the fleet spreads, which
+    sensors fit worst, which stand out and which are not determined; --format csv or json prints a row for each.
+    Exit code 1 means that a sensor is undetermined or failed, or missed the --tolerance.
+    """
+    from accelcal_cli.calibration.fleet import calibrate_fleet, check_settings
+    from accelcal_cli.config import load_settings
+    from accelcal_cli.sensor.fleet_files import read_fleet
+    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+
+    options.check_format(format)
+    for source in data:
+        options.check_input(source)
+    options.check_tolerance(tolerance)
+    folder = output is not None and _check_output(output)
+    stated_g = options.gravity(g, latitude, height)
+    stated: dict[str, Any] = {"g": stated_g, "gauge": gauge, "weights": weights}
+    overrides = {k: v for k, v in stated.items() if v is not None}
+    settings = load_settings(config, {"optimizer": "levenberg-marquardt", **overrides})
+    check_settings(settings)
+    readings = read_fleet(data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer)
+    if folder and output is not None:
+        fleet = _with_results(readings, settings, output)
+    else:
+        fleet = calibrate_fleet(readings, settings)
+    _show(fleet, readings, settings, format, None if folder else output)
+    if not quiet:
+        assumed = stated_g is None and settings.g == STANDARD_GRAVITY
+        _tell(readings, output, settings.g if assumed else None)
+    _judge(fleet, readings.sensors, tolerance)
+
+
+def _check_output(output: str) -> bool:
+    """Refuse an output that could not be written; return whether it is a folder."""
+    from accelcal_cli.output.files import check_folder, check_target
+
+    if output.endswith("/") or Path(output).is_dir():
+        check_folder(output)
+        return True
+    if Path(output).suffix not in SUFFIXES:
+        raise UsageError(
+            f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}, or a folder, ending in /'
+        )
+    check_target(output)
+    return False
+
+
+def _with_results(readings: FleetReadings, settings: Settings, output: str) -> Fleet:
+    """Calibrate, and write the result file of every sensor to a folder."""
+    from accelcal_cli.calibration.fleet import calibrate_fleet
+    from accelcal_cli.output.files import whole_folder
+    from accelcal_cli.output.fleet import write_result
+
+    with whole_folder(output) as made:
+        return calibrate_fleet(
+            readings, settings, lambda number, result: write_result(made, readings.sensors[number], result)
+        )
+
+
+def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
+    """Write the table of all sensors, then print the fleet in the chosen form."""
+    from accelcal_cli.calibration import fleet_tables
+    from accelcal_cli.calibration.standouts import standouts
+    from accelcal_cli.output import fleet as shown
+    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+
+    found = standouts(fleet, settings.g)
+    rows = fleet_tables.sensors(fleet, readings.sensors, found)
+    if output is not None:
+        shown.write_table(rows, output)
+    if format == "json":
+        sys.stdout.write(json_text(json_rows([rows])))
+    elif format == "csv":
+        write_csv(rows, sys.stdout)
+    else:
+        tables = fleet_tables.summary(fleet, readings.sensors, found, settings.g)
+        shown.show_fleet(fleet_tables.counts(fleet), tables)
+    sys.stdout.flush()
+
+
+def _tell(readings: FleetReadings, output: str | None, assumed: float | None) -> None:
+    """Say on standard error what was read, assumed and written."""
+    notes = list(dict.fromkeys(note for origin in readings.origins for note in origin.notes))
+    if assumed is not None:
+        notes.append(
+            f"g = {assumed} assumed; state yours with --g or --latitude and --height "
+            "(scale factors are proportional to it)"
+        )
+    if output is not None:
+        notes.append(f"wrote {output}")
+    for note in notes:
+        typer.echo(f"accelcal: {note}", err=True)
+
+
+def _judge(fleet: Fleet, labels: Sequence[str], tolerance: float | None) -> None:
+    """Name the sensors that are not determined or too far off, and exit 1 if there are any."""
+    kinds = {"undetermined or failed": ~fleet.determined}
+    if tolerance is not None:  # A sensor that failed has no rms; it is named already.
+        kinds[f"with an rms above the tolerance {tolerance:.6g}"] = fleet.rms > tolerance
+    for what, which in kinds.items():
+        names = [labels[r] for r in which.nonzero()[0].tolist()]
+        if names:
+            more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
+            count = f"{len(names):,} of {len(labels):,} sensors"
+            typer.echo(f"accelcal: {count} {what}: {', '.join(names[:NAMED])}{more}", err=True)
+    if any(which.any() for which in kinds.values()):
+        raise typer.Exit(BAD_VERDICT)
