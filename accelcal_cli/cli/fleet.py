@@ -71,7 +71,7 @@ def command(
     Exit code 1 means that a sensor is undetermined or failed, or missed the --tolerance.
     """
     from accelcal_cli.calibration.fleet import calibrate_fleet, check_settings
-    from accelcal_cli.config import load_settings
+    from accelcal_cli.config import load_mapping, load_settings
     from accelcal_cli.sensor.fleet_files import read_fleet
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
@@ -82,8 +82,9 @@ def command(
     folder = output is not None and _check_output(output)
     stated_g = options.gravity(g, latitude, height)
     stated: dict[str, Any] = {"g": stated_g, "gauge": gauge, "weights": weights}
-    overrides = {k: v for k, v in stated.items() if v is not None}
-    settings = load_settings(config, {"optimizer": "levenberg-marquardt", **overrides})
+    if config is None or "optimizer" not in load_mapping(config):
+        stated["optimizer"] = "levenberg-marquardt"
+    settings = load_settings(config, {k: v for k, v in stated.items() if v is not None})
     check_settings(settings)
     readings = read_fleet(data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer)
     if folder and output is not None:

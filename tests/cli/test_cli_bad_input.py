@@ -34,6 +34,7 @@ FILES = {
     "twice.yaml": "runs: 3\ngauge: lower\nruns: 4\n",
     "latin.yaml": b"optimizer: d\xe9\n",
     "nothing.yaml": "",
+    "optimizer.yaml": "optimizer: de\n",
     "number.yaml": "3\n",
     "keys.yaml": "3: 4\n",
     "python.yaml": "g: !!python/object/apply:os.getcwd []\n",
@@ -51,6 +52,13 @@ FILES = {
     "g-nan.yaml": "g: .nan\n",
     "singular.yaml": "K_a: [[1, 0, 0], [0, 1, 0], [0, 0, 0]]\n",
     "no-matrix.yaml": "noise: 1\n",
+    "fleet.csv": "sensor,Nx,Ny,Nz\n" + "".join(f"{s},{k % 7},{k % 5},{k}\n" for s in "AB" for k in range(12)),
+    "fleet-word.csv": "sensor,Nx,Ny,Nz\nA,1,2,3\nA,4,oops,6\n",
+    "fleet-gap.csv": "sensor,Nx,Ny,Nz\nA,1,2,3\n,4,5,6\n",
+    "fleet-rows.csv": "id,Nx,Ny,Nz\n1,1,2,3\n2,4,5,6\n3,4,4,4\n",
+    "fleet-two.csv": "device,serial,Nx,Ny,Nz\nA,A,1,2,3\n",
+    "fleet-axes.csv": "sensor,a,b,c,d\nA,1,2,3,4\n",
+    "fleet-bare.csv": "A,1,2,3\nA,4,5,6\n",
 }
 
 CALIBRATE = {
@@ -154,10 +162,59 @@ SIMULATE = {
     "negative g": (["--g", "-1"], ["--g -1", "expected"]),
     "latitude": (["--latitude", "91"], ["--latitude 91", "-90 to 90"]),
     "seed": (["--seed", "-1"], ["--seed", "-1"]),
+    "no sensors": (["--sensors", "0"], ["--sensors", "0 is not in the range"]),
+    "sensors of a log": (["--sensors", "3", "--raw"], ["--sensors", "--raw"]),
+    "too many sensors": (["--sensors", "10000000"], ["--sensors 10000000", "at most 100,000,000"]),
     "output folder": (["-o", "no/data.csv"], ["no/data.csv", "no such folder"]),
     "output is a folder": (["-o", "folder"], ["folder", "is a directory"]),
     "truth folder": (["--truth", "no/t.yaml", "-o", "data.csv"], ["no/t.yaml", "no such folder"]),
     "one file for both": (["--truth", "t.yaml", "-o", "t.yaml"], ["t.yaml", "another file"]),
+}
+
+FLEET = {
+    "missing file": (["flet.csv"], ["flet.csv", "no such file", 'did you mean "fleet.csv"']),
+    "missing second file": (["fleet.csv", "no.csv", "--sensor-column", "sensor"], ["no.csv", "no such file"]),
+    "a file twice": (["good.csv", "good.csv"], ["good.csv", "given twice"]),
+    "no data": ([], ["missing argument", "fleet --help"]),
+    "no sensor column": (
+        ["good.csv"],
+        ["good.csv", "labels the sensor", "serial", "--sensor-column", '"Nx"'],
+    ),
+    "no such sensor column": (
+        ["fleet.csv", "--sensor-column", "sensr"],
+        ["--sensor-column", '"sensr"', 'did you mean "sensor"'],
+    ),
+    "two sensor columns": (["fleet-two.csv"], ['"device" or "serial"', "--sensor-column"]),
+    "no header": (["fleet-bare.csv"], ["no header", "--sensor-column 1"]),
+    "a sensor in every row": (["fleet-rows.csv"], ["fleet-rows.csv", "every row", "--sensor-column"]),
+    "which columns": (["fleet-axes.csv"], ["fleet-axes.csv", "--columns"]),
+    "word in a number cell": (
+        ["fleet-word.csv"],
+        ["fleet-word.csv, line 3", '"Ny"', '"oops" is not a number'],
+    ),
+    "empty label": (["fleet-gap.csv"], ["fleet-gap.csv, line 3", '"sensor"', "is empty", "label"]),
+    "header only": (["header.csv", "--sensor-column", "1"], ["header.csv", "no readings below"]),
+    "empty standard input": (["-"], ["<stdin>", "empty"]),
+    "not Parquet": (["not.parquet"], ["not.parquet", "Parquet"]),
+    "gauge": (["fleet.csv", "--gauge", "lwer"], ["gauge", "lwer", 'did you mean "lower"']),
+    "gauge full": (["fleet.csv", "--gauge", "full"], ["gauge: full", "lower, upper, symmetric"]),
+    "weights": (["fleet.csv", "--weights", "all"], ["weights", "all", "none, n, sd"]),
+    "weights auto": (["fleet.csv", "--weights", "auto"], ["weights: auto", "none, n, sd"]),
+    "weights without counts": (["fleet.csv", "--weights", "n"], ["fleet.csv", 'sensor "A"', "--weights n"]),
+    "optimizer": (["fleet.csv", "--config", "optimizer.yaml"], ["optimizer", "levenberg-marquardt"]),
+    "unknown key": (
+        ["fleet.csv", "--config", "unknown.yaml"],
+        ["unknown.yaml", '"optimiser"', '"optimizer"'],
+    ),
+    "negative g": (["fleet.csv", "--g", "-9.8"], ["--g -9.8", "expected", "9.78 to 9.84"]),
+    "two gravities": (["fleet.csv", "--g", "9.8", "--latitude", "50"], ["--g and --latitude", "not both"]),
+    "nan tolerance": (["fleet.csv", "--tolerance", "nan"], ["--tolerance nan", "positive"]),
+    "format": (["fleet.csv", "--format", "jsn"], ["--format", '"jsn"', 'did you mean "json"']),
+    "output suffix": (["fleet.csv", "-o", "all.txt"], ["all.txt", ".csv, .parquet, .json", "folder"]),
+    "output folder": (["fleet.csv", "-o", "no/all.csv"], ["no/all.csv", "no such folder: no"]),
+    "output folder of a folder": (["fleet.csv", "-o", "no/all/"], ["no/all/", "no such folder: no"]),
+    "output is a file": (["fleet.csv", "-o", "good.csv/"], ["good.csv/", "is a file", "folder"]),
+    "output holds files": (["fleet.csv", "-o", "full"], ["full", "holds files already", "empty folder"]),
 }
 
 
@@ -168,6 +225,8 @@ def folder(good, tmp_path):
         (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "a.json").write_text("{}")
     return tmp_path
 
 
@@ -196,6 +255,14 @@ def test_simulate_refuses(run, folder, what):
     arguments, parts = SIMULATE[what]
     before = sorted(os.listdir(folder))
     refused(run("simulate", *arguments), parts)
+    assert sorted(os.listdir(folder)) == before
+
+
+@pytest.mark.parametrize("what", FLEET)
+def test_fleet_refuses(run, folder, what):
+    arguments, parts = FLEET[what]
+    before = sorted(os.listdir(folder))
+    refused(run("fleet", *arguments), parts)
     assert sorted(os.listdir(folder)) == before
 
 
