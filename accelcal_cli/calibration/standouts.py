@@ -22,6 +22,9 @@ FEWEST = 10
 EFFICIENCY = 0.37
 """A median absolute deviation of R values is worth the standard deviation of so many times R."""
 
+MOST_FREEDOM = 1000
+"""From here on Student's distribution is the normal one to any digit that matters."""
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -92,7 +95,7 @@ def standouts(fleet: Fleet, g: float) -> list[Standout]:
             continue  # all alike, but for rounding
         z = (values - middle) / spread
         far = np.flatnonzero(np.abs(z) > 3.0)
-        freedom = np.full(len(far), max(1, int(EFFICIENCY * len(known))))
+        freedom = np.full(len(far), min(MOST_FREEDOM, int(EFFICIENCY * len(known))))
         far = far[student_chance(np.abs(z[far]), freedom) * tests < LEVEL]
         found += [Standout(int(known[k]), quantity, float(values[k]), middle, float(z[k])) for k in far]
     found.sort(key=lambda one: -abs(one.z or 0.0))
