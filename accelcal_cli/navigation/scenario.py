@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -59,6 +60,11 @@ class Scenario:
         """Time between epochs. Units: s."""
         return float(self.seconds[1] - self.seconds[0])
 
+    @cached_property
+    def scale(self) -> tuple[Float, Float]:
+        """Metres of one radian of latitude and of longitude at the indicated places, shape (R, K)."""
+        return metres_per_radian(self.ins.latitude)
+
     def transitions(self, first: int, last: int) -> Float:
         """Return the metric transitions from epoch k to k + 1, first <= k < last, shape (R, last - first, 12, 12).
 
@@ -90,11 +96,10 @@ class Scenario:
     def anomaly(self, k: int, north: Float, east: Float) -> Float:
         """Return the map's anomaly in mGal at epoch k for position errors in m, shape (R, ...); NaN off the map."""
         shape = (self.runs,) + (1,) * (north.ndim - 1)
-        latitude = self.ins.latitude[:, k].reshape(shape)
-        meridian, parallel = metres_per_radian(latitude)
-        return self.gravity_map.at(
-            latitude - north / meridian, self.ins.longitude[:, k].reshape(shape) - east / parallel
+        latitude, longitude, meridian, parallel = (
+            v[:, k].reshape(shape) for v in (self.ins.latitude, self.ins.longitude, *self.scale)
         )
+        return self.gravity_map.at(latitude - north / meridian, longitude - east / parallel)
 
 
 def transitions(route: Route, first: int, last: int, period: float, grade: Grade) -> Float:
