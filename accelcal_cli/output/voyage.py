@@ -11,8 +11,10 @@ import numpy as np
 from accelcal_cli.navigation.bound import bound
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.output.plot import _style
-from accelcal_cli.studies.navigation import Navigation, axis_of, curves, own
+from accelcal_cli.studies.navigation import Navigation
+from accelcal_cli.studies.navigation_tables import curves, own
 from accelcal_cli.studies.study import Record
+from accelcal_cli.studies.voyage_curves import axis_of
 
 HOUR = 3600.0
 PANELS = (

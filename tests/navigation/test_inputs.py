@@ -21,7 +21,7 @@ from accelcal_cli.navigation.filters import FILTERS
 from accelcal_cli.navigation.map_files import load_map
 from accelcal_cli.navigation.voyage import Plan
 from accelcal_cli.navigation.voyage_file import read_voyage
-from accelcal_cli.studies.navigation import COLUMNS, beside
+from accelcal_cli.studies.navigation_tables import COLUMNS, beside
 from accelcal_cli.studies.voyages import Waters, load_waters
 from accelcal_cli.table import Table
 
