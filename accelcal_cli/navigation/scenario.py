@@ -33,6 +33,8 @@ class Scenario:
         measured: gravity anomaly, mGal, shape (R, K); NaN where there is none.
         error: true position error of the INS, m north and east, shape (R, K, 2); None when it is not known.
         route: the true track, shape (K,), or the indicated one when it is not known.
+        turns: changes of the indicated heading from epoch to epoch, clockwise, rad, shape (K - 1,). Of the heading, not
+            of the course by the indicated velocity: half a metre a second across 8 m/s would turn the biases by 4 deg.
     """
 
     gravity_map: GravityMap
@@ -44,6 +46,7 @@ class Scenario:
     measured: Float
     error: Float | None
     route: Route
+    turns: Float
 
     @property
     def runs(self) -> int:
@@ -70,7 +73,7 @@ class Scenario:
 
         At the indicated latitude and velocity, as a real filter has it.
         """
-        return transitions(self.ins, first, last, self.period, self.grade)
+        return transitions(self.ins, self.turns, (first, last), self.period, self.grade)
 
     def prior(self) -> Float:
         """Return the variances of the metric states at the start, shape (12,)."""
@@ -102,14 +105,14 @@ class Scenario:
         return self.gravity_map.at(latitude - north / meridian, longitude - east / parallel)
 
 
-def transitions(route: Route, first: int, last: int, period: float, grade: Grade) -> Float:
-    """Return the metric transitions along a track; see `Scenario.transitions`."""
+def transitions(route: Route, turns: Float, span: tuple[int, int], period: float, grade: Grade) -> Float:
+    """Return the metric transitions along a track with these changes of heading; see `Scenario.transitions`."""
+    first, last = span
     motion = route.motion()
     part = {name: getattr(motion, name)[..., first:last] for name in motion.__dataclass_fields__}
     F = discretise(dynamics(type(motion)(**part)), period)
     if grade.mounting == "strapdown":
-        turns = np.concatenate([route.turns(), np.zeros((*route.east.shape[:-1], 1))], axis=-1)
-        F = turned(F, turns[..., first:last])
+        F = turned(F, np.append(turns, 0.0)[first:last])
     after = np.minimum(np.arange(first + 1, last + 1), len(route.seconds) - 1)
     return metric(F, route.latitude[..., first:last], route.latitude[..., after])
 
@@ -163,4 +166,5 @@ def simulate(
         anomaly + noise * drawn,
         error,
         true,
+        true.turns(),  # the INS has its heading to the azimuth error, a milliradian
     )

@@ -123,6 +123,14 @@ def test_a_filter_beats_the_ins_and_not_the_bound(results, voyage, name):
     assert 0.8 * least < rmse(scores) < 0.5 * alone
 
 
+def test_strapped_down_biases_turn_with_the_heading_and_the_filter_knows(rough):
+    """By the course of the indicated velocity, which errs by degrees, the normalised error squared is above 10."""
+    ins = Grade(mounting="strapdown")
+    scenario = simulate(rough, Plan(), ins, runs=range(6), seed=1, period=60.0)
+    _, scores = run(scenario, "reference")
+    assert scores.nees.mean() < 4.0
+
+
 def test_the_order_that_is_told(results):
     found = {name: rmse(scores) for name, (_, scores) in results.items()}
     assert found["reference"] < 0.7 * found["pf"]

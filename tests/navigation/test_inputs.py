@@ -16,11 +16,11 @@ import pytest
 import accelcal_cli
 from accelcal_cli.errors import AccelcalError, DataError
 from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.field import Field, generate
+from accelcal_cli.navigation.field import PRESETS, Field, generate
 from accelcal_cli.navigation.filters import FILTERS
 from accelcal_cli.navigation.map_files import load_map
 from accelcal_cli.navigation.voyage import Plan
-from accelcal_cli.navigation.voyage_file import read_voyage
+from accelcal_cli.navigation.voyage_file import read_voyage, recorded
 from accelcal_cli.studies.navigation_tables import COLUMNS, beside
 from accelcal_cli.studies.voyages import Waters, load_waters
 from accelcal_cli.table import Table
@@ -193,6 +193,8 @@ def test_a_recorded_voyage_with_a_gap_is_refused(tmp_path):
         (lambda s: s.replace("latitude", "latitud", 1), 'no column "latitude" \\(did you mean "latitud"'),
         (lambda s: s.replace("20.31", "north", 1), 'line 2, column "latitude"'),
         (lambda s: s.replace(",3.5", ",3.5,9", 1), "line 2: expected 6 cells"),
+        (lambda s: s.replace(",3.5", ",inf", 1), "line 2, column \"gravity\": 'inf' is not a finite number"),
+        (lambda s: s.replace("20.30", "nan", 1), "line 2, column \"true_latitude\": 'nan' is not a finite"),
         (lambda s: s.split("\n")[0], "no rows"),
     ],
 )
@@ -223,6 +225,16 @@ def test_a_recorded_voyage_is_navigated(tmp_path):
     )
     assert [row["filter"] for row in rows] == ["reference", "pf"]
     assert all(row["rmse_position_m"] < row["ins_m"] for row in rows)
+
+
+def test_a_recorded_heading_turns_the_biases(tmp_path):
+    lines = voyage_rows(rows=4)
+    path = tmp_path / "log.csv"
+    degrees = ("heading", "350", "10", "10", "40")
+    path.write_text("\n".join(f"{line},{cell}" for line, cell in zip(lines, degrees, strict=True)))
+    flat = generate(PRESETS["constant"], 0)
+    found = recorded(read_voyage(str(path), 30.0), flat, Grade(), 1.0, 2000.0, range(1), 0)
+    np.testing.assert_allclose(np.degrees(found.turns), [20.0, 0.0, 30.0], atol=1e-9)
 
 
 def test_the_rows_have_their_names(quick, tmp_path):
