@@ -34,6 +34,9 @@ class DePf(Evolving):
     inflation: float = setting(
         1.02, "of the covariance at a window's end: the error of moments from N particles", low=1.0, high=2.0
     )
+    swell: float = setting(
+        4.0, "growth of the covariance when no track explains a window; 1: none", low=1.0, high=100.0
+    )
     F_min: float = setting(0.4, "least F [depf2015]", low=0.0, high=2.0)
     F_max: float = setting(1.0, "largest F [depf2015]", low=0.0, high=2.0)
     CR_min: float = setting(0.0, "least CR [depf2015]", low=0.0, high=1.0)
@@ -47,7 +50,7 @@ class DePf(Evolving):
         if self.mode == "literal" or self.road != "marginal":
             return super().run(scenario, streams)
         variance = self.variance or scenario.noise**2
-        form = Marginal(self.particles, self.generations, self.window, variance, self.inflation)
+        form = Marginal(self.particles, self.generations, self.window, variance, self.inflation, self.swell)
         return form.run(scenario, streams)
 
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
