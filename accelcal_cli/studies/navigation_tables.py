@@ -13,7 +13,7 @@ from accelcal_cli.navigation.scores import SETTLED, counted
 from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR
 from accelcal_cli.studies.navigation import Navigation
 from accelcal_cli.studies.study import Record
-from accelcal_cli.studies.voyage_curves import AXES, axis_of, mean_squares
+from accelcal_cli.studies.voyage_curves import AXES, axis_of, mean_squares, stride_of
 from accelcal_cli.table import Column, Table
 
 COLUMNS = (
@@ -121,29 +121,62 @@ def beside(table: Table, further: Mapping[str, Any]) -> Table:
     return Table(title, (*table.columns[:at], column, *table.columns[at:]), tuple(rows), notes)
 
 
+CURVES = (
+    Column("filter"),
+    Column("mode"),
+    Column("accelerometer_ug"),
+    Column("seconds", "s", "d"),
+    Column("rmse_latitude_m", "m", ".1f"),
+    Column("rmse_longitude_m", "m", ".1f"),
+    Column("rmse_position_m", "m", ".1f"),
+    Column("latitude", "deg", ".6f"),
+    Column("longitude", "deg", ".6f"),
+    Column("sigma_m", "m", ".1f"),
+)
+INS, BOUND = "INS alone", "bound"
+"""What stands among the filters in the curves."""
+
+
 def curves(study: Navigation, records: Sequence[Record]) -> Table:
-    """Return RMSE against time of every filter: the raw curves of the pictures, and run 0's corrected track."""
+    """Return RMSE against time of every filter, of the INS alone and the bound, and run 0's corrected track."""
     rows: list[tuple[object, ...]] = []
     for cell in range(study.cells):
-        kept = own(records, cell)
-        names = study.names(cell)
-        first = {axis: dict(zip(*axis_of(kept[0], axis), strict=True)) for axis in AXES}
-        squares = {axis: mean_squares(kept, axis) for axis in ("north", "east")}
-        for second in first["sigma"]:
-            north, east = squares["north"].get(second), squares["east"].get(second)
+        rows += _curves_of(study.names(cell), own(records, cell))
+    for grade in study.grades:
+        rows += _limits(study, grade)
+    return Table("RMSE against time", CURVES, tuple(rows))
+
+
+def _curves_of(names: Mapping[str, str], records: Sequence[Record]) -> list[tuple[object, ...]]:
+    first = {axis: dict(zip(*axis_of(records[0], axis), strict=True)) for axis in AXES}
+    squares = [mean_squares(records, axis) for axis in ("north", "east")]
+    return [
+        (names["filter"], names["mode"], float(names["accelerometer_ug"]), int(second),
+         *_roots(*(square.get(second) for square in squares)),
+         first["latitude"].get(second), first["longitude"].get(second), sigma)
+        for second, sigma in first["sigma"].items()
+    ]  # fmt: skip
+
+
+def _limits(study: Navigation, grade: Grade) -> list[tuple[object, ...]]:
+    """Return the rows of the INS alone, of the study's runs, and of the bound."""
+    scenario = study.waters.scenario(grade, range(study.repeats), study.seed)
+    stride = stride_of(scenario)
+    indicated = np.degrees([scenario.ins.latitude[0, ::stride], scenario.ins.longitude[0, ::stride]])
+    alone = None if scenario.error is None else np.square(scenario.error[:, ::stride]).mean(axis=0)
+    rows: list[tuple[object, ...]] = []
+    for name, squares in ((INS, alone), (BOUND, bound(scenario)[::stride])):
+        for k, second in enumerate(scenario.seconds[::stride]):
+            place = indicated[:, k] if name == INS else (None, None)
+            known = (None, None) if squares is None else squares[k]
             rows.append(
-                (
-                    names["filter"], names["mode"], float(names["accelerometer_ug"]), int(second),
-                    None if north is None else north**0.5,
-                    None if east is None else east**0.5,
-                    None if north is None or east is None else (north + east) ** 0.5,
-                    first["latitude"].get(second), first["longitude"].get(second), first["sigma"][second],
-                )
-            )  # fmt: skip
-    columns = (
-        Column("filter"), Column("mode"), Column("accelerometer_ug"), Column("seconds", "s", "d"),
-        Column("rmse_latitude_m", "m", ".1f"), Column("rmse_longitude_m", "m", ".1f"),
-        Column("rmse_position_m", "m", ".1f"),
-        Column("latitude", "deg", ".6f"), Column("longitude", "deg", ".6f"), Column("sigma_m", "m", ".1f"),
-    )  # fmt: skip
-    return Table("RMSE against time", columns, tuple(rows))
+                (name, "", float(f"{grade.accelerometer:.6g}"), round(second), *_roots(*known), *place, None)
+            )
+    return rows
+
+
+def _roots(north: float | None, east: float | None) -> tuple[float | None, ...]:
+    """Return the roots of mean squares north and east, and of their sum."""
+    if north is None or east is None:
+        return None if north is None else north**0.5, None if east is None else east**0.5, None
+    return tuple(float(square**0.5) for square in (north, east, north + east))

@@ -23,7 +23,7 @@ OFFSET = 10_000_000
 
 def curve_of(i: int, scenario: Scenario, track: Track, scores: Scores) -> tuple[tuple[int, float], ...]:
     """Return errors north and east, corrected place (degrees) and claimed sigma of a run, block by block."""
-    stride = max(1, round(EVERY / scenario.period))
+    stride = stride_of(scenario)
     seconds = scenario.seconds[::stride]
     latitude = scenario.ins.latitude[i, ::stride]
     meridian, parallel = metres_per_radian(latitude)
@@ -40,6 +40,11 @@ def curve_of(i: int, scenario: Scenario, track: Track, scores: Scores) -> tuple[
         for second, value in zip(seconds, block, strict=True)
         if np.isfinite(value)
     )
+
+
+def stride_of(scenario: Scenario) -> int:
+    """Return the epochs between the points of a curve."""
+    return max(1, round(EVERY / scenario.period))
 
 
 def axis_of(record: Record, axis: str) -> tuple[Float, Float]:
