@@ -27,8 +27,8 @@ from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float
 
 STATES = 12
-TAYLOR_TERMS = 9
-"""Of the matrix exponential: for steps to 60 s the next one is below 1e-16 of the largest element."""
+TAYLOR_TERMS = {60.0: 9, 600.0: 16}
+"""Of the matrix exponential, for steps up to so many s: the next one is below rounding."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,12 @@ def dynamics(motion: Motion) -> Float:
 
 
 def discretise(A: Float, step: float) -> Float:
-    """Return exp(A step), shape (..., 12, 12), by its Taylor series; step in s."""
+    """Return exp(A step), shape (..., 12, 12), by its Taylor series; step in s, to 600."""
     scaled = A * step
     total = np.eye(A.shape[-1]) + scaled
     term = scaled
-    for n in range(2, TAYLOR_TERMS + 1):
+    terms = next(count for longest, count in TAYLOR_TERMS.items() if step <= longest)
+    for n in range(2, terms + 1):
         term = term @ scaled / n
         total += term
     return total
