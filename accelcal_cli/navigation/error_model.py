@@ -27,8 +27,8 @@ from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float
 
 STATES = 12
-TAYLOR_TERMS = {60.0: 9, 600.0: 16}
-"""Of the matrix exponential, for steps up to so many s: the next one is below rounding."""
+MINUTE, TAYLOR_TERMS, LONG_TERMS = 60.0, 9, 16
+"""Of the matrix exponential, for steps up to a minute and up to ten: the next one is below rounding."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,7 @@ def discretise(A: Float, step: float) -> Float:
     scaled = A * step
     total = np.eye(A.shape[-1]) + scaled
     term = scaled
-    terms = next(count for longest, count in TAYLOR_TERMS.items() if step <= longest)
-    for n in range(2, terms + 1):
+    for n in range(2, (TAYLOR_TERMS if step <= MINUTE else LONG_TERMS) + 1):
         term = term @ scaled / n
         total += term
     return total
