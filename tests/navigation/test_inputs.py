@@ -256,7 +256,12 @@ def test_the_rows_have_their_names(quick, tmp_path):
     }
     assert [row["filter"] for row in rows] == ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
     assert all(contract <= set(row) for row in rows)
-    assert out.read_text().startswith("filter,mode,accelerometer_ug,seconds,rmse_latitude_m")
+    header, *curves = out.read_text().splitlines()
+    assert header.startswith("filter,mode,accelerometer_ug,seconds,rmse_latitude_m")
+    named = {line.split(",")[0] for line in curves}
+    assert named == {"pf", "pso-pf", "apo-pf", "de-pf", "reference", "INS alone", "bound"}
+    start = next(line.split(",") for line in curves if line.startswith("INS alone"))
+    assert 1000 < float(start[6]) < 1700  # the drift at the start of filtering
     assert len(raw.read_text().splitlines()) == 11
 
 
@@ -290,6 +295,7 @@ def test_a_calibration_changes_the_ins(quick, tmp_path):
     )
     assert rows[0]["accelerometer_ug"] == 50.0
     assert 0 < rows[1]["accelerometer_ug"] < 50.0
+    assert rows[1]["bound_m"] < rows[0]["bound_m"]
 
 
 @pytest.mark.parametrize(
