@@ -21,6 +21,9 @@ PANELS = (
     ("rmse_longitude_m", "longitude"),
     ("rmse_position_m", "position"),
 )
+LEGEND = 125
+"""Characters across the picture."""
+
 LIMITS: dict[object, dict[str, Any]] = {
     INS: {"color": "0.35", "lw": 1.2, "ls": ":"},
     BOUND: {"color": "black", "lw": 1.0, "ls": "--"},
@@ -44,7 +47,8 @@ def plot_voyage(study: Navigation, records: Sequence[Record], path: str) -> None
         _draw_map(panels[0], study, records, labels)
         _draw_errors(panels[1:], study, records)
         handles, names = panels[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
+        columns = max(1, min(len(names), LEGEND // (max(map(len, names)) + 6)))
+        figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
         svg = Path(path).suffix == ".svg"
         with whole_file(path, binary=True) as file:
             figure.savefig(
