@@ -78,7 +78,8 @@ def _draw_map(axes: Any, study: Navigation, records: Sequence[Record], labels: l
         interpolation="bilinear",
     )
     axes.figure.colorbar(picture, ax=axes, label="gravity anomaly, mGal", shrink=0.8)
-    axes.plot(np.degrees(route.longitude), np.degrees(route.latitude), color="black", lw=2.5, label="true")
+    track = np.degrees([route.longitude, route.latitude])
+    axes.plot(*track, color="black", lw=6.0, alpha=0.25, label="true")  # a band below the lines
     ins = scenario.ins
     axes.plot(
         np.degrees(ins.longitude[0]),
@@ -89,9 +90,8 @@ def _draw_map(axes: Any, study: Navigation, records: Sequence[Record], labels: l
     for cell, label in enumerate(labels):
         first = own(records, cell)[0]
         axes.plot(axis_of(first, "longitude")[1], axis_of(first, "latitude")[1], label=label, **_style(cell))
-    for name, track in (("x", route.longitude), ("y", route.latitude)):
-        low, high = np.degrees(track.min()), np.degrees(track.max())
-        getattr(axes, f"set_{name}lim")(low - 0.12, high + 0.12)
+    for name, values in zip("xy", track, strict=True):
+        getattr(axes, f"set_{name}lim")(values.min() - 0.12, values.max() + 0.12)
     axes.set(title="Run 0 over the map", xlabel="longitude, deg", ylabel="latitude, deg")
 
 
