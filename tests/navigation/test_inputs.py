@@ -266,7 +266,7 @@ def test_the_rows_have_their_names(quick, tmp_path):
 
 
 def test_jobs_do_not_change_the_result(quick):
-    common = ("--config", quick, "--filter", "pf", "--runs", 30, "--format", "json", "-q")
+    common = ("--config", quick, "--filter", "pf", "--runs", 60, "--format", "json", "-q")
     alone, together = (json.loads(navigate(*common, "--jobs", jobs))[0] for jobs in (1, 2))
     assert alone["rmse_position_m"] == together["rmse_position_m"]
 
