@@ -182,7 +182,7 @@ def _calibrated(waters: Waters, path: Path) -> tuple[Waters, tuple[Grade, ...]]:
 def show(study: Navigation, records: Sequence[Record], format: str) -> None:
     """Print the summary in a format; "" prints nothing."""
     from accelcal_cli.output.plain import json_rows, json_text, write_csv
-    from accelcal_cli.studies.navigation import summary
+    from accelcal_cli.studies.navigation_tables import summary
 
     rows = summary(study, records)
     if format == "json":
@@ -210,7 +210,8 @@ def reproduce(
 ) -> None:
     """Run a shipped experiment on navigation filters and print it beside the paper's numbers."""
     from accelcal_cli.output.plain import json_rows, json_text, write_csv
-    from accelcal_cli.studies.navigation import Navigation, beside, summary
+    from accelcal_cli.studies.navigation import Navigation
+    from accelcal_cli.studies.navigation_tables import beside, summary
     from accelcal_cli.studies.voyages import load_waters
 
     waters, entries, further = load_waters(name, {})
@@ -240,7 +241,7 @@ def reproduce(
 def _write_curves(study: Navigation, records: Sequence[Record], output: str) -> None:
     from accelcal_cli.output.files import whole_file
     from accelcal_cli.output.plain import write_csv
-    from accelcal_cli.studies.navigation import curves
+    from accelcal_cli.studies.navigation_tables import curves
 
     with whole_file(output) as file:
         write_csv(curves(study, records), file)

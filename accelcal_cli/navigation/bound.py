@@ -25,7 +25,9 @@ def bound(scenario: Scenario) -> Float:
     north, east = scenario.gravity_map.slope(latitude, longitude)
     slope = np.stack([north, east], axis=-1) / np.stack(metres_per_radian(latitude), axis=-1)
     slope[np.isnan(slope).any(axis=1) | np.isnan(scenario.measured[0])] = 0.0
-    F = transitions(route, 0, scenario.epochs, scenario.period, scenario.grade).reshape(-1, 12, 12)
+    F = transitions(route, scenario.turns, (0, scenario.epochs), scenario.period, scenario.grade).reshape(
+        -1, 12, 12
+    )
     Q = np.diag(process_noise(scenario.grade, scenario.period))
     P = np.diag(scenario.prior())
     out = np.empty((scenario.epochs, 2))

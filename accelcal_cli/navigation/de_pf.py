@@ -14,7 +14,7 @@ import numpy as np
 from accelcal_cli.navigation.differential import Operators, evolve, metropolis
 from accelcal_cli.navigation.filters import FILTERS, Track
 from accelcal_cli.navigation.marginal import Marginal
-from accelcal_cli.navigation.particle import Cloud, Evolving, Fitness
+from accelcal_cli.navigation.particle import Cloud, Counted, Evolving, Fitness
 from accelcal_cli.navigation.resampling import moments, systematic
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import setting
@@ -34,6 +34,9 @@ class DePf(Evolving):
     inflation: float = setting(
         1.02, "of the covariance at a window's end: the error of moments from N particles", low=1.0, high=2.0
     )
+    swell: float = setting(
+        4.0, "growth of the covariance when no track explains a window; 1: none", low=1.0, high=100.0
+    )
     F_min: float = setting(0.4, "least F [depf2015]", low=0.0, high=2.0)
     F_max: float = setting(1.0, "largest F [depf2015]", low=0.0, high=2.0)
     CR_min: float = setting(0.0, "least CR [depf2015]", low=0.0, high=1.0)
@@ -47,7 +50,7 @@ class DePf(Evolving):
         if self.mode == "literal" or self.road != "marginal":
             return super().run(scenario, streams)
         variance = self.variance or scenario.noise**2
-        form = Marginal(self.particles, self.generations, self.window, variance, self.inflation)
+        form = Marginal(self.particles, self.generations, self.window, variance, self.inflation, self.swell)
         return form.run(scenario, streams)
 
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
@@ -72,9 +75,11 @@ class DePf(Evolving):
     ) -> tuple[Cloud, int]:
         if self.road != "metropolis":
             return super()._safe(scenario, cloud, prior, k, streams)
-        return self._metropolis(scenario, cloud, prior, k, streams), self.particles
+        return self._metropolis(scenario, cloud, prior, k, streams)
 
-    def _metropolis(self, scenario: Scenario, cloud: Cloud, prior: Float, k: int, streams: Streams) -> Cloud:
+    def _metropolis(
+        self, scenario: Scenario, cloud: Cloud, prior: Float, k: int, streams: Streams
+    ) -> tuple[Cloud, int]:
         """Resample, then move all by DE-MC on prior times likelihood; the weights are equal after."""
         x = cloud.x[..., :2]
         mean, covariance = moments(prior, x)
@@ -82,14 +87,15 @@ class DePf(Evolving):
         weights = np.exp(cloud.log_weights - cloud.log_weights.max(axis=1, keepdims=True))
         chosen = systematic(weights / weights.sum(axis=1, keepdims=True), streams.uniform(1, 1)[:, 0, 0])
 
-        def rate(position: Float) -> Float:
+        def posterior(position: Float) -> Float:
             away = position - mean[:, None]
             distance: Float = ((away @ inverse) * away).sum(axis=2)
             return self.likelihood(scenario, k, position) - 0.5 * distance
 
+        rate = Counted(posterior)
         moved = np.take_along_axis(cloud.x, chosen[:, :, None], axis=1)
         position, level = moved[..., :2], rate(moved[..., :2])
         for _ in range(self.generations):
             position, level = metropolis(position, level, rate, streams)
         moved[..., :2] = position
-        return Cloud(moved, np.zeros(cloud.log_weights.shape))
+        return Cloud(moved, np.zeros(cloud.log_weights.shape)), rate.points

@@ -45,7 +45,7 @@ def evolve(
         movers, generations: how many and how often.
         rate: log fitness of positions, shape (R, movers, 2).
     """
-    x, fitness = x.copy(), fitness.copy()
+    x, fitness = x.copy("K"), fitness.copy()
     count = x.shape[1]
     for _ in range(generations):
         best = fitness.argmax(axis=1)[:, None]
@@ -92,7 +92,7 @@ def metropolis(
         rate: log density of points, shape (R, n, d).
         spread: sigma of the density, for the jitter.
     """
-    x, level = x.copy(), level.copy()
+    x, level = x.copy("K"), level.copy()
     count, d = x.shape[1:]
     half = count // 2
     for mine, others in ((slice(0, half), slice(half, count)), (slice(half, count), slice(0, half))):
@@ -111,4 +111,6 @@ def metropolis(
 
 
 def _taken(x: Float, index: Int) -> Float:
-    return np.take_along_axis(x, index[:, :, None], axis=1)
+    """Return the particles at index, shape (R, n, d), population-contiguous as the streams are."""
+    taken: Float = np.take_along_axis(x.swapaxes(1, 2), index[:, None], axis=2).swapaxes(1, 2)
+    return taken

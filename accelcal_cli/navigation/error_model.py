@@ -27,8 +27,8 @@ from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float
 
 STATES = 12
-TAYLOR_TERMS = 9
-"""Of the matrix exponential: for steps to 60 s the next one is below 1e-16 of the largest element."""
+MINUTE, TAYLOR_TERMS, LONG_TERMS = 60.0, 9, 16
+"""Of the matrix exponential, for steps up to a minute and up to ten: the next one is below rounding."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,11 @@ def dynamics(motion: Motion) -> Float:
 
 
 def discretise(A: Float, step: float) -> Float:
-    """Return exp(A step), shape (..., 12, 12), by its Taylor series; step in s."""
+    """Return exp(A step), shape (..., 12, 12), by its Taylor series; step in s, to 600."""
     scaled = A * step
     total = np.eye(A.shape[-1]) + scaled
     term = scaled
-    for n in range(2, TAYLOR_TERMS + 1):
+    for n in range(2, (TAYLOR_TERMS if step <= MINUTE else LONG_TERMS) + 1):
         term = term @ scaled / n
         total += term
     return total

@@ -89,8 +89,9 @@ class GravityMap:
         b = (np.atleast_1d(longitude) - self.west) / self.step_east
         i, j = np.floor(a), np.floor(b)
         outside: Bool = ~((a >= 0.0) & (a <= rows - 1) & (b >= 0.0) & (b <= columns - 1))
-        np.clip(np.nan_to_num(i, copy=False), 0, rows - 2, out=i)
-        np.clip(np.nan_to_num(j, copy=False), 0, columns - 2, out=j)
+        for node, last in ((i, rows - 2), (j, columns - 2)):
+            np.fmax(node, 0.0, out=node)  # of a number and NaN the number: an unknown place has a cell too
+            np.fmin(node, last, out=node)
         a -= i
         b -= j
         i *= columns

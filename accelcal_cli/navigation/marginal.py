@@ -38,11 +38,6 @@ SETTLED = 0.5
 UNEXPLAINED = 4.0
 """Least mean misfit squared over R at which no track explains a window: by chance once in 60 000 windows of ten."""
 
-SWELL = 4.0
-"""By so much the covariance grows then: the cloud is at a wrong place, or too narrow.
-
-It does not grow beyond the initial error."""
-
 TINY = 1e-12
 
 
@@ -90,13 +85,18 @@ class Window:
 
 @dataclass(frozen=True)
 class Marginal:
-    """The filter; see the module and `DePf` for the settings."""
+    """The filter; see the module and `DePf` for the settings.
+
+    When no track explains a window the cloud is at a wrong place, or too narrow: its covariance then grows by `swell`,
+    not beyond the initial error.
+    """
 
     particles: int
     generations: int
     window: int
     variance: float
     inflation: float
+    swell: float
 
     def run(self, scenario: Scenario, streams: Streams) -> Track:
         """Return the track, window by window."""
@@ -134,7 +134,7 @@ class Marginal:
         u, mean, covariance = self._moved(scenario, window, (u, level, edge), streams)
         wide = np.square(state.root[:, :2, :2]).sum(axis=(1, 2)) > scenario.initial**2
         lost = (misfit > UNEXPLAINED * (last - first)) & math.isinf(edge) & ~wide
-        swell = np.where(lost, SWELL, 1.0)
+        swell = np.where(lost, self.swell, 1.0)
         return carried(window, state, (mean, self.inflation * covariance, swell), u, streams)
 
     def _likelihoods(self, scenario: Scenario, window: Window, u: Float) -> Float:

@@ -23,6 +23,9 @@ Fitness = Callable[[Float], Float]
 CHUNK = 60
 """Epochs whose transition matrices are made together."""
 
+UNSEEN = -1e5
+"""Log-likelihood below which no particle is on the map."""
+
 GATE = 3.0
 """Evolved particles stay within so many sigma of the predicted cloud [chosen]."""
 
@@ -33,6 +36,19 @@ class Cloud:
 
     x: Float
     log_weights: Float
+
+
+class Counted:
+    """A fitness that counts the points it was asked for."""
+
+    def __init__(self, rate: Fitness) -> None:
+        """Count from nothing."""
+        self.rate, self.points = rate, 0
+
+    def __call__(self, position: Float) -> Float:
+        """Return the fitness of positions, shape (R, n, 2)."""
+        self.points += position.shape[0] * position.shape[1]
+        return self.rate(position)
 
 
 @dataclass(frozen=True)
@@ -60,7 +76,7 @@ class Sir(Filter):
         track = Track.empty(scenario)
         cloud = self._start(scenario, streams)
         F: Float = np.empty(0)
-        lookups = 0
+        lookups = 0.0
         for k in range(scenario.epochs):
             if k and self.state == STATES and (k - 1) % CHUNK == 0:
                 F = scenario.transitions(k - 1, min(k - 1 + CHUNK, scenario.epochs))
@@ -80,11 +96,11 @@ class Sir(Filter):
         cloud: Cloud,
         k: int,
         streams: Streams,  # noqa: ARG002  # an evolution draws from them
-    ) -> tuple[Cloud, Float, int, Bool]:
-        """Return the cloud with its new weights, these as numbers, the look-ups, and which runs see the map."""
+    ) -> tuple[Cloud, Float, float, Bool]:
+        """Return the cloud with its new weights, these as numbers, a run's look-ups, and which runs see the map."""
         likelihood = self.likelihood(scenario, k, cloud.x)
         cloud = replace(cloud, log_weights=cloud.log_weights + likelihood)
-        seen: Bool = likelihood.max(axis=1) > -1e5
+        seen: Bool = likelihood.max(axis=1) > UNSEEN
         return cloud, normalised(cloud.log_weights), self.particles, seen
 
     def likelihood(self, scenario: Scenario, k: int, x: Float) -> Float:
@@ -148,23 +164,22 @@ class Evolving(Sir):
 
     def update(
         self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
-    ) -> tuple[Cloud, Float, int, Bool]:
+    ) -> tuple[Cloud, Float, float, Bool]:
         """Return the cloud evolved and weighed; see `Sir.update`."""
+        if self.mode == "literal" and self.generations:
+            return self._literal(scenario, cloud, k, streams)
         old = cloud
         cloud, weights, used, seen = super().update(scenario, cloud, k, streams)
         if not self.generations:
             return cloud, weights, used, seen
-        if self.mode == "literal":
-            moved = self._literal(scenario, old, k, streams)
-            return moved, normalised(moved.log_weights), used + self.particles * self.generations, seen
         rows = np.flatnonzero(effective_size(weights) < self.threshold * self.particles)
         if len(rows):
             part = Cloud(cloud.x[rows], cloud.log_weights[rows])
             prior = normalised(old.log_weights[rows])
             now = scenario.instant(rows, max(0, k + 1 - self.memory), k + 1)
-            part, movers = self._safe(now, part, prior, now.epochs - 1, streams.take(rows))
+            part, lookups = self._safe(now, part, prior, now.epochs - 1, streams.take(rows))
             cloud.x[rows], cloud.log_weights[rows] = part.x, part.log_weights
-            used += round(movers * self.generations * len(rows) * now.epochs / scenario.runs)
+            used += lookups / scenario.runs
         return cloud, normalised(cloud.log_weights), used, seen
 
     @property
@@ -172,28 +187,36 @@ class Evolving(Sir):
         """Epochs that the fitness looks at."""
         return 1
 
-    def _literal(self, scenario: Scenario, old: Cloud, k: int, streams: Streams) -> Cloud:
-        def rate(position: Float) -> Float:
-            return self.likelihood(scenario, k, position)
-
-        x = old.x.copy()
-        x[..., :2] = self.evolve(x[..., :2], rate(x), self.particles, rate, streams)
-        return Cloud(x, old.log_weights + rate(x))
+    def _literal(
+        self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
+    ) -> tuple[Cloud, Float, float, Bool]:
+        """Evolve all particles toward the likelihood alone, then weigh them; see `Sir.update`."""
+        rate = Counted(lambda position: self.likelihood(scenario, k, position))
+        x = cloud.x.copy()
+        fitness = rate(x)
+        x[..., :2] = self.evolve(x[..., :2], fitness, self.particles, rate, streams)
+        moved = Cloud(x, cloud.log_weights + rate(x))
+        seen: Bool = fitness.max(axis=1) > UNSEEN
+        return moved, normalised(moved.log_weights), rate.points / scenario.runs, seen
 
     def _safe(
         self, scenario: Scenario, cloud: Cloud, prior: Float, k: int, streams: Streams
     ) -> tuple[Cloud, int]:
-        """Evolve the worst particles toward the posterior; their old weight becomes the mean one."""
+        """Evolve the worst particles toward the posterior; their old weight becomes the mean one.
+
+        Also return the look-ups of all runs.
+        """
         mean, covariance = moments(prior, cloud.x[..., :2])
         scale = np.sqrt(np.einsum("rii->ri", covariance)) + 1e-9
         inverse = np.linalg.inv(covariance + 1e-6 * np.eye(2))
 
-        def rate(position: Float) -> Float:
+        def posterior(position: Float) -> Float:
             away = position - mean[:, None]
             distance = ((away @ inverse) * away).sum(axis=2)
             inside = (np.abs(away) <= GATE * scale[:, None]).all(axis=2)
             return np.where(inside, self.fitness(scenario, k, position) - 0.5 * distance, -np.inf)
 
+        rate = Counted(posterior)
         order = np.argsort(cloud.log_weights, axis=1, kind="stable")
         x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
         logs = np.take_along_axis(cloud.log_weights, order, axis=1)
@@ -205,7 +228,7 @@ class Evolving(Sir):
         share = np.take_along_axis(prior / prior.max(axis=1, keepdims=True), order, axis=1)[:, :movers]
         likelihood = self.likelihood(scenario, k, x[:, :movers])
         logs[:, :movers] = likelihood + np.log(share.mean(axis=1, keepdims=True) + 1e-300)
-        return Cloud(x, logs), movers
+        return Cloud(x, logs), rate.points * scenario.epochs + likelihood.size
 
     def fitness(self, scenario: Scenario, k: int, position: Float) -> Float:
         """Return the likelihood part of the fitness; shape (R, n)."""

@@ -27,7 +27,7 @@ TOGETHER = 0.01
 """Squared Mahalanobis distance of the positions below which a lighter component is merged into the heaviest."""
 
 
-MEMORY, UNFIT, WIDER = 30.0, 4.0, 4.0
+MEMORY, UNFIT = 30.0, 4.0
 """A component whose normalised innovation squared, 1 when all is well, is above UNFIT over MEMORY measurements is
 wrong: its covariance grows."""
 
@@ -63,6 +63,12 @@ class Reference(Filter):
 
     mode: Literal["default", "literal"] = setting("default", "the same filter in either mode")
     components: int = setting(5, "on either axis of the initial square", low=1, high=50)
+    swell: float = setting(
+        4.0,
+        "growth of a component's covariance when its innovations do not fit; 1: none",
+        low=1.0,
+        high=100.0,
+    )
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -79,7 +85,7 @@ class Reference(Filter):
             bank, known = _updated(scenario, bank, k)
             track.blind[:] += np.bincount(bank.run, known, scenario.runs) == 0
             track.mean[:, k], track.covariance[:, k] = _moments(bank, scenario.runs)
-            bank = _widened(_pruned(bank, scenario.runs), scenario.initial)
+            bank = _widened(_pruned(bank, scenario.runs), scenario.initial, self.swell)
             if k % CHUNK == 0:
                 F = scenario.transitions(k, min(k + CHUNK, scenario.epochs))
                 bank = _merged(bank)
@@ -159,12 +165,12 @@ def _pruned(bank: Bank, runs: int) -> Bank:
     return bank if keep.all() else bank.at(keep)
 
 
-def _widened(bank: Bank, initial: float) -> Bank:
+def _widened(bank: Bank, initial: float, swell: float) -> Bank:
     """Return the bank in which components whose innovations do not fit are wider, to the initial error at most."""
     wrong = (bank.misfit > UNFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
     if not wrong.any():
         return bank
-    P = np.where(wrong[:, None, None], WIDER * bank.P, bank.P)
+    P = np.where(wrong[:, None, None], swell * bank.P, bank.P)
     return replace(bank, P=P, misfit=np.where(wrong, 1.0, bank.misfit))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -32,6 +33,8 @@ class Scenario:
         measured: gravity anomaly, mGal, shape (R, K); NaN where there is none.
         error: true position error of the INS, m north and east, shape (R, K, 2); None when it is not known.
         route: the true track, shape (K,), or the indicated one when it is not known.
+        turns: changes of the indicated heading from epoch to epoch, clockwise, rad, shape (K - 1,). Of the heading, not
+            of the course by the indicated velocity: half a metre a second across 8 m/s would turn the biases by 4 deg.
     """
 
     gravity_map: GravityMap
@@ -43,6 +46,7 @@ class Scenario:
     measured: Float
     error: Float | None
     route: Route
+    turns: Float
 
     @property
     def runs(self) -> int:
@@ -59,12 +63,17 @@ class Scenario:
         """Time between epochs. Units: s."""
         return float(self.seconds[1] - self.seconds[0])
 
+    @cached_property
+    def scale(self) -> tuple[Float, Float]:
+        """Metres of one radian of latitude and of longitude at the indicated places, shape (R, K)."""
+        return metres_per_radian(self.ins.latitude)
+
     def transitions(self, first: int, last: int) -> Float:
         """Return the metric transitions from epoch k to k + 1, first <= k < last, shape (R, last - first, 12, 12).
 
         At the indicated latitude and velocity, as a real filter has it.
         """
-        return transitions(self.ins, first, last, self.period, self.grade)
+        return transitions(self.ins, self.turns, (first, last), self.period, self.grade)
 
     def prior(self) -> Float:
         """Return the variances of the metric states at the start, shape (12,)."""
@@ -90,21 +99,20 @@ class Scenario:
     def anomaly(self, k: int, north: Float, east: Float) -> Float:
         """Return the map's anomaly in mGal at epoch k for position errors in m, shape (R, ...); NaN off the map."""
         shape = (self.runs,) + (1,) * (north.ndim - 1)
-        latitude = self.ins.latitude[:, k].reshape(shape)
-        meridian, parallel = metres_per_radian(latitude)
-        return self.gravity_map.at(
-            latitude - north / meridian, self.ins.longitude[:, k].reshape(shape) - east / parallel
+        latitude, longitude, meridian, parallel = (
+            v[:, k].reshape(shape) for v in (self.ins.latitude, self.ins.longitude, *self.scale)
         )
+        return self.gravity_map.at(latitude - north / meridian, longitude - east / parallel)
 
 
-def transitions(route: Route, first: int, last: int, period: float, grade: Grade) -> Float:
-    """Return the metric transitions along a track; see `Scenario.transitions`."""
+def transitions(route: Route, turns: Float, span: tuple[int, int], period: float, grade: Grade) -> Float:
+    """Return the metric transitions along a track with these changes of heading; see `Scenario.transitions`."""
+    first, last = span
     motion = route.motion()
     part = {name: getattr(motion, name)[..., first:last] for name in motion.__dataclass_fields__}
     F = discretise(dynamics(type(motion)(**part)), period)
     if grade.mounting == "strapdown":
-        turns = np.concatenate([route.turns(), np.zeros((*route.east.shape[:-1], 1))], axis=-1)
-        F = turned(F, turns[..., first:last])
+        F = turned(F, np.append(turns, 0.0)[first:last])
     after = np.minimum(np.arange(first + 1, last + 1), len(route.seconds) - 1)
     return metric(F, route.latitude[..., first:last], route.latitude[..., after])
 
@@ -158,4 +166,5 @@ def simulate(
         anomaly + noise * drawn,
         error,
         true,
+        true.turns(),  # the INS has its heading to the azimuth error, a milliradian
     )

@@ -82,9 +82,7 @@ class Route:
 
     def turns(self) -> Float:
         """Return the changes of the heading between points, clockwise, rad, shape (..., K - 1)."""
-        change = np.diff(np.arctan2(self.east, self.north), axis=-1)
-        nearest: Float = np.remainder(change + math.pi, 2.0 * math.pi) - math.pi
-        return nearest
+        return wrapped(np.diff(np.arctan2(self.east, self.north), axis=-1))
 
     def motion(self) -> Motion:
         """Return the motion with the accelerations that the velocities give."""
@@ -95,6 +93,12 @@ class Route:
             np.gradient(self.east, self.step, axis=-1),
             np.gradient(self.north, self.step, axis=-1),
         )
+
+
+def wrapped(angle: Float) -> Float:
+    """Return angles between -pi and pi, rad."""
+    nearest: Float = np.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
+    return nearest
 
 
 def planned(plan: Plan) -> Route:

@@ -1,9 +1,9 @@
 """A recorded voyage from CSV: the indicated track, gravity, and the true track where one was kept.
 
 Columns by name, in any order: time (s), latitude, longitude (degrees, indicated by the INS); and if there, gravity
-(mGal), east and north (indicated velocity, m/s), true_latitude, true_longitude (degrees). An
-empty gravity cell is an epoch
-without a measurement.
+(mGal), east and north (indicated velocity, m/s), heading (indicated, degrees clockwise from north; needed for sensors
+that are strapped down), true_latitude, true_longitude (degrees). An empty gravity cell is an epoch without a
+measurement.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from accelcal_cli.navigation.earth import metres_per_radian
 from accelcal_cli.navigation.error_model import Grade
 from accelcal_cli.navigation.gravity_map import GravityMap
 from accelcal_cli.navigation.scenario import GRAVITY_PURPOSE, Scenario
-from accelcal_cli.navigation.voyage import Route
+from accelcal_cli.navigation.voyage import Route, wrapped
 from accelcal_cli.streams import Float, Streams
 
 NEEDED = ("time", "latitude", "longitude")
-FURTHER = ("gravity", "east", "north", "true_latitude", "true_longitude")
+FURTHER = ("gravity", "east", "north", "heading", "true_latitude", "true_longitude")
 GAP = 1.5
 """Times the usual step between rows."""
 
@@ -105,7 +105,8 @@ def _numbers(path: str, line: int, header: list[str], cells: list[str]) -> list[
             if name in NEEDED + FURTHER:
                 raise DataError(f'{path}, line {line}, column "{name}": {cell!r} is not a number') from None
             value = math.nan
-        if name in NEEDED and not math.isfinite(value):
+        missing = name == "gravity" and math.isnan(value)
+        if name in NEEDED + FURTHER and not (missing or math.isfinite(value)):
             raise DataError(f'{path}, line {line}, column "{name}": {cell!r} is not a finite number')
         found.append(value)
     return found
@@ -142,7 +143,8 @@ def recorded(
     else:
         drawn = Streams(seed, runs, GRAVITY_PURPOSE).normal(1, shape[1])[:, 0]
         measured = gravity_map.at(route.latitude, route.longitude) + noise * drawn
-    return Scenario(gravity_map, grade, noise, initial, own["time"], ins, measured, error, route)
+    turns = wrapped(np.diff(np.radians(own["heading"]))) if voyage.has("heading") else indicated.turns()
+    return Scenario(gravity_map, grade, noise, initial, own["time"], ins, measured, error, route, turns)
 
 
 def _route(own: dict[str, Float], north: str, east: str) -> Route:

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from accelcal_cli.navigation.bound import bound
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.output.plot import _style
-from accelcal_cli.studies.navigation import Navigation, axis_of, curves, own
+from accelcal_cli.studies.navigation import Navigation
+from accelcal_cli.studies.navigation_tables import BOUND, INS, curves, own
 from accelcal_cli.studies.study import Record
+from accelcal_cli.studies.voyage_curves import axis_of
 
 HOUR = 3600.0
 PANELS = (
-    ("rmse_latitude_m", "latitude", 0),
-    ("rmse_longitude_m", "longitude", 1),
-    ("rmse_position_m", "position", None),
+    ("rmse_latitude_m", "latitude"),
+    ("rmse_longitude_m", "longitude"),
+    ("rmse_position_m", "position"),
 )
+LEGEND = 125
+"""Characters across the picture."""
+
+LIMITS: dict[object, dict[str, Any]] = {
+    INS: {"color": "0.35", "lw": 1.2, "ls": ":"},
+    BOUND: {"color": "black", "lw": 1.0, "ls": "--"},
+}
 
 
 def plot_voyage(study: Navigation, records: Sequence[Record], path: str) -> None:
@@ -37,9 +45,10 @@ def plot_voyage(study: Navigation, records: Sequence[Record], path: str) -> None
         panels = figure.subplots(2, 2).ravel()
         labels = [_label(study, cell) for cell in range(study.cells)]
         _draw_map(panels[0], study, records, labels)
-        _draw_errors(panels[1:], study, records, labels)
+        _draw_errors(panels[1:], study, records)
         handles, names = panels[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
+        columns = max(1, min(len(names), LEGEND // (max(map(len, names)) + 6)))
+        figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
         svg = Path(path).suffix == ".svg"
         with whole_file(path, binary=True) as file:
             figure.savefig(
@@ -69,46 +78,35 @@ def _draw_map(axes: Any, study: Navigation, records: Sequence[Record], labels: l
         interpolation="bilinear",
     )
     axes.figure.colorbar(picture, ax=axes, label="gravity anomaly, mGal", shrink=0.8)
-    axes.plot(np.degrees(route.longitude), np.degrees(route.latitude), color="black", lw=2.5, label="true")
+    track = np.degrees([route.longitude, route.latitude])
+    axes.plot(*track, color="black", lw=6.0, alpha=0.25, label="true")  # a band below the lines
     ins = scenario.ins
     axes.plot(
         np.degrees(ins.longitude[0]),
         np.degrees(ins.latitude[0]),
-        color="0.35",
-        lw=1.2,
-        ls=":",
-        label="INS alone",
+        label=INS,
+        **LIMITS[INS],
     )
     for cell, label in enumerate(labels):
         first = own(records, cell)[0]
         axes.plot(axis_of(first, "longitude")[1], axis_of(first, "latitude")[1], label=label, **_style(cell))
-    for name, track in (("x", route.longitude), ("y", route.latitude)):
-        low, high = np.degrees(track.min()), np.degrees(track.max())
-        getattr(axes, f"set_{name}lim")(low - 0.12, high + 0.12)
+    for name, values in zip("xy", track, strict=True):
+        getattr(axes, f"set_{name}lim")(values.min() - 0.12, values.max() + 0.12)
     axes.set(title="Run 0 over the map", xlabel="longitude, deg", ylabel="latitude, deg")
 
 
-def _draw_errors(panels: Any, study: Navigation, records: Sequence[Record], labels: list[str]) -> None:
+def _draw_errors(panels: Any, study: Navigation, records: Sequence[Record]) -> None:
     """Draw RMSE against time of every cell, with the bound and the INS alone."""
     table = curves(study, records).records()
-    scenario = study.waters.scenario(study.grades[0], range(min(study.repeats, 20)), study.seed)
-    least = bound(scenario)
-    hours = scenario.seconds / HOUR
-    keys = [
-        (n["filter"], n["mode"], float(n["accelerometer_ug"])) for n in map(study.names, range(study.cells))
-    ]
-    for axes, (key, name, axis) in zip(panels, PANELS, strict=True):
-        for cell, _ in enumerate(labels):
-            rows = [r for r in table if (r["filter"], r["mode"], r["accelerometer_ug"]) == keys[cell]]
-            points = [(r["seconds"] / HOUR, r[key]) for r in rows if r[key] is not None]
+    lines: dict[tuple[object, ...], list[Mapping[str, Any]]] = {}
+    for row in table:
+        lines.setdefault((row["filter"], row["mode"], row["accelerometer_ug"]), []).append(row)
+    for axes, (key, name) in zip(panels, PANELS, strict=True):
+        for cell, ((kind, _, _), rows) in enumerate(lines.items()):
+            points = [(row["seconds"] / HOUR, row[key]) for row in rows if row[key] is not None]
             if points:
-                axes.plot(*zip(*points, strict=True), **_style(cell))
-        chosen = least.sum(axis=1) if axis is None else least[:, axis]
-        axes.plot(hours, np.sqrt(chosen), color="black", lw=1.0, ls="--")
-        axes.annotate("bound", (hours[-1], np.sqrt(chosen[-1])), fontsize=8, ha="right", va="top")
-        if scenario.error is not None:
-            square = np.square(scenario.error).mean(axis=0)
-            alone = square.sum(axis=1) if axis is None else square[:, axis]
-            axes.plot(hours, np.sqrt(alone), color="0.35", lw=1.2, ls=":")
+                axes.plot(*zip(*points, strict=True), **LIMITS.get(kind, _style(cell)))
+            if kind == BOUND:
+                axes.annotate("bound", points[-1], fontsize=8, ha="right", va="top")
         axes.set(title=f"RMSE of {name}", xlabel="hour of the voyage", ylabel="m", yscale="log")
         axes.grid(True, color="0.9", linewidth=0.6)

@@ -16,12 +16,12 @@ import pytest
 import accelcal_cli
 from accelcal_cli.errors import AccelcalError, DataError
 from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.field import Field, generate
+from accelcal_cli.navigation.field import PRESETS, Field, generate
 from accelcal_cli.navigation.filters import FILTERS
 from accelcal_cli.navigation.map_files import load_map
 from accelcal_cli.navigation.voyage import Plan
-from accelcal_cli.navigation.voyage_file import read_voyage
-from accelcal_cli.studies.navigation import COLUMNS, beside
+from accelcal_cli.navigation.voyage_file import read_voyage, recorded
+from accelcal_cli.studies.navigation_tables import COLUMNS, beside
 from accelcal_cli.studies.voyages import Waters, load_waters
 from accelcal_cli.table import Table
 
@@ -92,26 +92,82 @@ def test_a_bad_map_is_refused(tmp_path, text, told):
         load_map(str(path))
 
 
-@pytest.mark.skipif(importlib.util.find_spec("xarray") is None, reason="needs the extra maps")
-def test_netcdf_is_read(tmp_path):
+inside_affine = pytest.mark.filterwarnings(
+    "ignore:Use `@` matmul:PendingDeprecationWarning"
+)  # of rioxarray's code
+maps = pytest.mark.skipif(importlib.util.find_spec("rioxarray") is None, reason="needs the extra maps")
+
+
+def as_array(grid, names=("lat", "lon")):
+    """Return a map as an xarray from north to south, as most files have it."""
     import xarray
 
-    grid = generate(SMALL, 0)
     rows, columns = grid.values.shape
     latitude = np.degrees(grid.south) + np.arange(rows) / 60
     longitude = np.degrees(grid.west) + np.arange(columns) / 60
-    data = xarray.DataArray(
-        grid.values[::-1], coords={"lat": latitude[::-1], "lon": longitude}, dims=("lat", "lon")
+    coordinates = {names[0]: latitude[::-1], names[1]: longitude}
+    return xarray.DataArray(grid.values[::-1], coords=coordinates, dims=names)
+
+
+@maps
+def test_netcdf_is_read(tmp_path):
+    grid = generate(SMALL, 0)
+    path = tmp_path / "map.nc"
+    as_array(grid).to_dataset(name="anomaly").to_netcdf(path)
+    read = load_map(str(path))
+    np.testing.assert_allclose(read.values, grid.values, atol=1e-9)
+    assert (read.south, read.west) == pytest.approx((grid.south, grid.west), abs=1e-12)
+    both = as_array(grid).to_dataset(name="anomaly")
+    both.assign(error=both.anomaly).to_netcdf(path)
+    with pytest.raises(DataError, match="one variable on a grid, not 2"):
+        load_map(str(path))
+
+
+@maps
+@inside_affine
+def test_geotiff_is_read_and_its_missing_value_is_no_value(tmp_path):
+    import rioxarray  # noqa: F401  # gives arrays .rio
+
+    grid = generate(SMALL, 0)
+    path = tmp_path / "map.tif"
+    holed = as_array(grid, ("y", "x"))
+    holed[3, 5] = np.nan
+    holed.rio.write_crs(4326).rio.write_nodata(-9999.0, encoded=True).rio.to_raster(path)
+    read = load_map(str(path))
+    rows = grid.values.shape[0]
+    assert np.argwhere(np.isnan(read.values)).tolist() == [[rows - 4, 5]]
+    np.testing.assert_allclose(
+        np.where(np.isnan(read.values), grid.values, read.values), grid.values, atol=1e-9
     )
-    data.to_dataset(name="anomaly").to_netcdf(tmp_path / "map.nc")
-    np.testing.assert_allclose(load_map(str(tmp_path / "map.nc")).values, grid.values, atol=1e-9)
+    assert (read.south, read.west) == pytest.approx((grid.south, grid.west), abs=1e-9)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("xarray") is not None, reason="the extra maps is installed")
-def test_netcdf_without_xarray_says_what_to_install(tmp_path):
-    (tmp_path / "map.nc").write_bytes(b"CDF")
-    with pytest.raises(DataError, match="accelcal\\[maps\\]"):
-        load_map(str(tmp_path / "map.nc"))
+@maps
+@inside_affine
+def test_a_map_in_metres_is_refused(tmp_path):
+    grid = as_array(generate(SMALL, 0), ("y", "x"))
+    path = tmp_path / "map.tif"
+    grid.assign_coords(x=grid.x * 1e5, y=grid.y * 1e5).rio.write_crs(32650).rio.to_raster(path)
+    with pytest.raises(DataError, match="expected degrees, not metres"):
+        load_map(str(path))
+
+
+@pytest.mark.parametrize("name", ["map.nc", "map.grd", "map.tif"])
+def test_a_file_that_is_no_map_gives_one_message(tmp_path, name):
+    """Without the extra the message says what to install."""
+    (tmp_path / name).write_bytes(b"not a map")
+    told = "cannot be read" if importlib.util.find_spec("rioxarray") else "accelcal\\[maps\\]"
+    with pytest.raises(DataError, match=told) as caught:
+        load_map(str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "package"), [("map.nc", "xarray"), ("map.tif", "rioxarray")])
+def test_without_its_package_a_map_says_what_to_install(tmp_path, monkeypatch, name, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match=f"needs {package}: pip install 'accelcal\\[maps\\]'"):
+        load_map(str(tmp_path / name))
 
 
 def voyage_rows(rows=240, period=30.0, gravity=True):
@@ -137,6 +193,8 @@ def test_a_recorded_voyage_with_a_gap_is_refused(tmp_path):
         (lambda s: s.replace("latitude", "latitud", 1), 'no column "latitude" \\(did you mean "latitud"'),
         (lambda s: s.replace("20.31", "north", 1), 'line 2, column "latitude"'),
         (lambda s: s.replace(",3.5", ",3.5,9", 1), "line 2: expected 6 cells"),
+        (lambda s: s.replace(",3.5", ",inf", 1), "line 2, column \"gravity\": 'inf' is not a finite number"),
+        (lambda s: s.replace("20.30", "nan", 1), "line 2, column \"true_latitude\": 'nan' is not a finite"),
         (lambda s: s.split("\n")[0], "no rows"),
     ],
 )
@@ -169,6 +227,16 @@ def test_a_recorded_voyage_is_navigated(tmp_path):
     assert all(row["rmse_position_m"] < row["ins_m"] for row in rows)
 
 
+def test_a_recorded_heading_turns_the_biases(tmp_path):
+    lines = voyage_rows(rows=4)
+    path = tmp_path / "log.csv"
+    degrees = ("heading", "350", "10", "10", "40")
+    path.write_text("\n".join(f"{line},{cell}" for line, cell in zip(lines, degrees, strict=True)))
+    flat = generate(PRESETS["constant"], 0)
+    found = recorded(read_voyage(str(path), 30.0), flat, Grade(), 1.0, 2000.0, range(1), 0)
+    np.testing.assert_allclose(np.degrees(found.turns), [20.0, 0.0, 30.0], atol=1e-9)
+
+
 def test_the_rows_have_their_names(quick, tmp_path):
     out, raw = tmp_path / "curves.csv", tmp_path / "runs.csv"
     rows = json.loads(
@@ -188,12 +256,17 @@ def test_the_rows_have_their_names(quick, tmp_path):
     }
     assert [row["filter"] for row in rows] == ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
     assert all(contract <= set(row) for row in rows)
-    assert out.read_text().startswith("filter,mode,accelerometer_ug,seconds,rmse_latitude_m")
+    header, *curves = out.read_text().splitlines()
+    assert header.startswith("filter,mode,accelerometer_ug,seconds,rmse_latitude_m")
+    named = {line.split(",")[0] for line in curves}
+    assert named == {"pf", "pso-pf", "apo-pf", "de-pf", "reference", "INS alone", "bound"}
+    start = next(line.split(",") for line in curves if line.startswith("INS alone"))
+    assert 1000 < float(start[6]) < 1700  # the drift at the start of filtering
     assert len(raw.read_text().splitlines()) == 11
 
 
 def test_jobs_do_not_change_the_result(quick):
-    common = ("--config", quick, "--filter", "pf", "--runs", 30, "--format", "json", "-q")
+    common = ("--config", quick, "--filter", "pf", "--runs", 60, "--format", "json", "-q")
     alone, together = (json.loads(navigate(*common, "--jobs", jobs))[0] for jobs in (1, 2))
     assert alone["rmse_position_m"] == together["rmse_position_m"]
 
@@ -222,6 +295,7 @@ def test_a_calibration_changes_the_ins(quick, tmp_path):
     )
     assert rows[0]["accelerometer_ug"] == 50.0
     assert 0 < rows[1]["accelerometer_ug"] < 50.0
+    assert rows[1]["bound_m"] < rows[0]["bound_m"]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_the_eigen_periods_are_earth_rate_and_schuler_split_by_foucault(latitude
     assert 0.5 * (slow + fast) / 60 == pytest.approx(84.4, abs=0.8)
 
 
-@pytest.mark.parametrize("step", [1.0, 10.0, 60.0])
+@pytest.mark.parametrize("step", [1.0, 10.0, 60.0, 600.0])
 def test_the_discretisation_is_the_matrix_exponential(step):
     motion = Motion(*(np.array([v]) for v in (0.4, 7.5, -2.7, 0.1, -0.1)))
     A = dynamics(motion)
