@@ -87,8 +87,8 @@ def cluster(address: str) -> Iterator[Executor]:
     """Open a Dask cluster as an executor of the concurrent.futures kind.
 
     Raises:
-        DataError: dask is not installed, the address is none, nothing answers at the address, no worker is there, one runs another
-            version of accelcal, or the cluster is lost on the way.
+        DataError: dask is not installed, the address is none, nothing answers there, no worker is there, one runs
+            another version of accelcal, or the cluster is lost on the way.
     """
     try:
         import distributed
