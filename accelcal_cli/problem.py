@@ -113,11 +113,13 @@ class Counted(Problem):
     def cost(self, x: Float) -> Float:
         """Return the cost with NaN as +inf; see `Problem.cost`."""
         fx = self.problem.cost(x)
-        least = np.minimum.reduce(fx, axis=1)  # NaN of a run with one
+        column = fx.argmin(axis=1)  # the first NaN of a run with one
+        least = points(fx, column)
         if math.isnan(least.dot(least)):
             fx = np.where(np.isnan(fx), np.inf, fx)
-            least = np.minimum.reduce(fx, axis=1)
-        self._note(x, fx, least)
+            column = fx.argmin(axis=1)
+            least = points(fx, column)
+        self._note(x, column, least)
         return fx
 
     def residuals(self, x: Float) -> Float:
@@ -125,7 +127,8 @@ class Counted(Problem):
         r = self.problem.residuals(x)
         fx = np.einsum("rpm,rpm->rp", r, r)
         fx = np.where(np.isnan(fx), np.inf, fx)
-        self._note(x, fx, np.minimum.reduce(fx, axis=1))
+        column = fx.argmin(axis=1)
+        self._note(x, column, points(fx, column))
         return r
 
     def jacobian(self, x: Float) -> Float:
@@ -161,15 +164,15 @@ class Counted(Problem):
         part.best_x, part.best_cost = self.best_x[index], self.best_cost[index]
         return part
 
-    def _note(self, x: Float, fx: Float, least: Float) -> None:
-        """Enter points, their costs and the least cost of each run; best_x and best_cost become new arrays."""
+    def _note(self, x: Float, column: Int, least: Float) -> None:
+        """Enter points, which of each run is the best and its cost; best_x and best_cost become new arrays."""
         self.spent += x.shape[1]
         better = least < self.best_cost
         count = np.count_nonzero(better)
         if not count:
             return
-        found = points(x, fx.argmin(axis=1))
-        if count == len(fx):
+        found = points(x, column)
+        if count == len(least):
             self.best_x, self.best_cost = found, least
         else:
             self.best_x = np.where(better[:, None], found, self.best_x)
@@ -204,7 +207,7 @@ def differences(problem: Problem, x: Float) -> tuple[Float, Float]:
 
 
 def points(x: Float, index: Int) -> Float:
-    """Return the point of each run's population, x of shape (R, P, D), at its index, (R,): a copy, shape (R, D)."""
+    """Return the point (or cost) of each run's population, (R, P, ...), at its index, (R,): a copy, shape (R, ...)."""
     if len(index) == 1:  # Indexing by one number is several times as fast as by arrays.
         return x[:, index[0]].copy()
     chosen: Float = x[np.arange(len(index)), index]

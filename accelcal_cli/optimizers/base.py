@@ -19,6 +19,12 @@ from accelcal_cli.problem import Bound, Problem, points
 from accelcal_cli.registry import Registry, check, setting
 from accelcal_cli.streams import Float, Int, Streams
 
+AHEAD = 1600
+"""Points whose chances are drawn at once: several iterations of a small batch."""
+
+Chance = tuple[NDArray[Any], ...]
+"""What chance decides in one iteration: arrays of shape (R, ...)."""
+
 RUNNING, CONVERGED, FAILED = 0, 1, 2
 """Values of `State.status`: go on, nothing left to gain, numerical failure."""
 
@@ -50,6 +56,8 @@ def take(state: S, index: Int) -> S:
 def _taken(part: Any, index: Int) -> Any:
     if isinstance(part, np.ndarray):
         return part[index]
+    if isinstance(part, tuple):
+        return tuple(_taken(one, index) for one in part)
     held: Any = part if dataclasses.is_dataclass(part) else None
     return part if held is None else take(held, index)
 
@@ -93,15 +101,31 @@ class Optimizer(ABC):
 OPTIMIZERS: Registry[Optimizer] = Registry("accelcal_cli.optimizers", "optimizer")
 
 
+def drawn(rng: Streams, fx: Float, rows: int, columns: int) -> Float:
+    """Return uniform numbers for the iterations to come, shape (R, K, rows, columns), population-contiguous.
+
+    K shrinks with the batch fx, shape (R, P). Each run draws in the order of its iterations, so that its numbers
+    do not depend on its company.
+    """
+    steps = max(1, AHEAD // fx.size)
+    u = rng.uniform(rows, steps * columns).transpose(0, 2, 1)
+    return u.reshape(len(fx), steps, columns, rows).swapaxes(2, 3)
+
+
+def each(*parts: NDArray[Any]) -> tuple[Chance, ...]:
+    """Return arrays of shape (R, K, ...) as the chances of K iterations, one entry an iteration."""
+    return tuple(tuple(part[:, k] for part in parts) for k in range(parts[0].shape[1]))
+
+
 def gather(x: Float, index: Int) -> Float:
-    """Return points of each run's population counted round: x (R, P, D) at index (R, Q) modulo P, (R, Q, D)."""
+    """Return points of each run's population, x (R, P, D) at index (R, Q): shape (R, Q, D)."""
     flat = x.transpose(0, 2, 1)
     if len(flat) == 1:
-        only: Float = flat[0].take(index[0], axis=1, mode="wrap")[None]
+        only: Float = flat[0].take(index[0], axis=1, mode="clip")[None]
         return only.transpose(0, 2, 1)
     out = np.empty((*flat.shape[:2], index.shape[1]))
     for source, columns, target in zip(flat, index, out, strict=True):
-        source.take(columns, axis=1, out=target, mode="wrap")
+        source.take(columns, axis=1, out=target, mode="clip")  # "raise" would copy once more
     return out.transpose(0, 2, 1)
 
 
@@ -126,8 +150,8 @@ def best_of(x: Float, fx: Float) -> Float:
 
 
 def integers(u: Float, *below: int) -> Int:
-    """Return integers, shape (R, C, P), from uniform numbers, shape (R, P, C); column c is in 0 .. below[c] - 1."""
-    whole: Int = (u.transpose(0, 2, 1) * _column(below)).astype(np.intp)
+    """Return integers, shape (..., C, P), from uniform numbers, shape (..., P, C); column c is in 0 .. below[c] - 1."""
+    whole: Int = (u.swapaxes(-1, -2) * _column(below)).astype(np.intp)
     return whole
 
 
@@ -140,13 +164,15 @@ def partners(picks: Int) -> tuple[Int, Int]:
     """Return two distinct partners, neither of them itself, for every individual.
 
     Args:
-        picks: random integers below P - 1 and below P - 2, shape (R, 2, P), P >= 3; used up.
+        picks: random integers below P - 1 and below P - 2, shape (..., 2, P), P >= 3; overwritten by the indices.
 
     Returns:
-        Indices modulo P, twice (R, P). Drawn without rejection: the first is so many places further among
+        Indices, twice (..., P). Drawn without rejection: the first is so many places further among
         the P - 1 others, the second among the P - 2 that remain.
     """
-    first, second = picks[:, 0], picks[:, 1]
+    first, second = picks[..., 0, :], picks[..., 1, :]
     second += second >= first
-    picks += np.arange(1, picks.shape[2] + 1)
+    size = picks.shape[-1]
+    picks += np.arange(1, size + 1)
+    picks -= size * (picks >= size)
     return first, second

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from accelcal_cli.optimizers.base import CONVERGED, RUNNING, State
 from accelcal_cli.problem import Problem
-from accelcal_cli.streams import Bool, Float, Streams
+from accelcal_cli.streams import Float, Streams
 
 SMALLEST_SIGMA = 1e-300
 
@@ -31,6 +32,7 @@ class Constants:
     chi: float  # E |N(0, I)|
 
     @classmethod
+    @cache
     def of(cls, samples: int, D: int) -> Constants:
         """Return the default constants."""
         raw = math.log((samples + 1) / 2) - np.log(np.arange(1, samples // 2 + 1))
@@ -99,45 +101,53 @@ def step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaSta
     """Sample, rank, and adapt mean, paths, covariance and step size."""
     samples, D = state.x.shape[1:]
     k = Constants.of(samples, D)
-    z = rng.normal(samples, D)
-    y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
-    x = state.mean[:, None] + state.sigma[:, None, None] * y  # eq. 40
-    x, outside = np.clip(x, problem.lower, problem.upper), x
-    # The steps as drawn, not as rounded: rounded to the spacing of doubles around the mean they shrink to nothing, and
-    # sigma with them, one step of that spacing before the minimum.
-    y = np.where(x == outside, y, (x - state.mean[:, None]) / state.sigma[:, None, None])
+    x, y = _sample(problem, state, rng)
     fx = problem.cost(x)
-    order = np.argsort(fx, axis=1, kind="stable")[:, : len(k.weights)]
-    chosen = np.take_along_axis(y, order[..., None], axis=1)
+    rows, order = np.arange(len(fx))[:, None], np.argsort(fx, axis=1, kind="stable")
+    ranked, chosen = fx[rows, order], y[rows, order[:, : len(k.weights)]]
     moved = np.add.reduce(k.weights[:, None] * chosen, axis=1)  # eq. 41
     mean = state.mean + state.sigma[:, None] * moved  # eq. 42
-    white = _whiten(state, moved)
-    path_sigma = (1 - k.c_sigma) * state.path_sigma + math.sqrt(
-        k.c_sigma * (2 - k.c_sigma) * k.mu_eff
-    ) * white  # eq. 43
+    kept, push = 1 - k.c_sigma, math.sqrt(k.c_sigma * (2 - k.c_sigma) * k.mu_eff)
+    path_sigma = kept * state.path_sigma + push * _whiten(state, moved)  # eq. 43
     length = np.sqrt(np.add.reduce(path_sigma**2, axis=1))
-    sigma = state.sigma * np.exp(k.c_sigma / k.d_sigma * (length / k.chi - 1))  # eq. 44
-    sigma = np.where(_flat(fx), sigma * math.exp(0.2 + k.c_sigma / k.d_sigma), sigma)
-    sigma = np.minimum(sigma, (problem.upper - problem.lower).max())
-    bound = (1.4 + 2 / (D + 1)) * k.chi * math.sqrt(1 - (1 - k.c_sigma) ** (2 * (state.generation + 1)))
+    sigma = _step_size(problem, state.sigma, length, ranked, k)
+    bound = (1.4 + 2 / (D + 1)) * k.chi * math.sqrt(1 - kept ** (2 * (state.generation + 1)))
     short = (length < bound)[:, None]  # h_sigma
     path_c = (1 - k.c_c) * state.path_c + short * math.sqrt(k.c_c * (2 - k.c_c) * k.mu_eff) * moved  # eq. 45
     C = _adapt(state.C, path_c, chosen, short, k)
     values, axes = np.linalg.eigh(C)
     lengths = np.sqrt(np.maximum(values, 0.0))
     used = state.used + samples
-    done = (sigma * lengths.max(axis=1) < SMALLEST_SIGMA) | (fx.min(axis=1) == 0) | (used + samples > budget)
+    done = (sigma * lengths[:, -1] < SMALLEST_SIGMA) | (ranked[:, 0] == 0) | (used + samples > budget)
     status = np.where(done, CONVERGED, RUNNING).astype(np.int8)
     return CmaState(
         x, fx, mean, sigma, C, axes, lengths, path_sigma, path_c, state.generation + 1, used, status=status
     )
 
 
-def _flat(fx: Float) -> Bool:
-    """Return which runs' best 70 % of samples cost the same: no direction to go, so the step has to grow."""
-    ranked = np.sort(fx, axis=1)
-    flat: Bool = ranked[:, 0] == ranked[:, math.ceil(0.7 * fx.shape[1]) - 1]
-    return flat
+def _sample(problem: Problem, state: CmaState, rng: Streams) -> tuple[Float, Float]:
+    """Return new points, pressed into the box, and their steps from the mean over sigma, shapes (R, P, D)."""
+    z = rng.normal(*state.x.shape[1:])
+    y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
+    mean, sigma = state.mean[:, None], state.sigma[:, None, None]
+    drawn = mean + sigma * y  # eq. 40
+    x = np.clip(drawn, *problem.limits)
+    pressed = x != drawn
+    if pressed.any():
+        # The other steps stay as drawn, not as rounded: rounded to the spacing of doubles around the mean they shrink
+        # to nothing, and sigma with them, one step of that spacing before the minimum.
+        y = np.where(pressed, (x - mean) / sigma, y)
+    return x, y
+
+
+def _step_size(problem: Problem, sigma: Float, length: Float, ranked: Float, k: Constants) -> Float:
+    """Return the new sigma, eq. 44, from the length of its path and the costs in order, at most the box."""
+    sigma = sigma * np.exp(k.c_sigma / k.d_sigma * (length / k.chi - 1))
+    # The best 70 % of samples cost the same: no direction to go, so the step has to grow.
+    flat = ranked[:, 0] == ranked[:, math.ceil(0.7 * ranked.shape[1]) - 1]
+    sigma = np.where(flat, sigma * math.exp(0.2 + k.c_sigma / k.d_sigma), sigma)
+    least: Float = np.minimum(sigma, (problem.upper - problem.lower).max())
+    return least
 
 
 def _whiten(state: CmaState, y: Float) -> Float:

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.optimizers.base import (
     OPTIMIZERS,
+    Chance,
     Optimizer,
     State,
     best_of,
     better_of,
+    drawn,
+    each,
     gather,
     integers,
     partners,
@@ -29,17 +31,32 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Int, Streams
 
 
-def mutates(u: Float, share: float, gene: Int) -> NDArray[np.bool_]:
-    """Return where a trial takes the mutant's gene, shape (R, P, D), [dpso2014] eq. 5.
+def mutates(u: Float, share: float, gene: Int) -> Float:
+    """Return 1 where a trial takes the mutant's gene, 0 where its parent's, shape (R, K, P, D), [dpso2014] eq. 5.
 
     Args:
-        u: uniform numbers, one a gene, shape (R, P, D).
+        u: uniform numbers, one a gene, shape (R, K, P, D).
         share: P_c, the probability to keep the parent's gene.
-        gene: J_rand, the gene always taken from the mutant, shape (R, P).
+        gene: J_rand, the gene always taken from the mutant, shape (R, K, P).
     """
-    taken = u > share
-    taken[np.arange(u.shape[0])[:, None], np.arange(u.shape[1]), gene] = True
+    taken = (u > share).astype(float)
+    runs, steps, individuals = (np.arange(size) for size in gene.shape)
+    taken[runs[:, None, None], steps[:, None], individuals, gene] = 1.0
     return taken
+
+
+def apart(x: Float, picks: Int) -> tuple[Float, ...]:
+    """Return the points of x, shape (R, P, D), at every row of picks, shape (R, C, Q): C arrays (R, Q, D)."""
+    runs, rows, size = picks.shape
+    points = gather(x, picks.reshape(runs, rows * size))
+    return tuple(points[:, size * row : size * (row + 1)] for row in range(rows))
+
+
+@dataclass(frozen=True)
+class Generation(State):
+    """A population; x and fx are the individuals and their costs."""
+
+    chances: tuple[Chance, ...] = ()  # partners n, m and base vector, (R, 3, P); 1 where mutated, (R, P, D)
 
 
 @OPTIMIZERS.register("de")
@@ -60,31 +77,37 @@ class DifferentialEvolution(Optimizer):
         "what the crossover probability keeps: parent as in the DPSO paper, mutant as in Storn and Price",
     )
 
-    def init(self, problem: Problem, x: Float, rng: Streams) -> State:
+    def init(self, problem: Problem, x: Float, rng: Streams) -> Generation:
         """Evaluate the starting population."""
-        return State(x, problem.cost(x))
+        return Generation(x, problem.cost(x))
 
-    def step(self, problem: Problem, state: State, rng: Streams) -> State:
+    def step(self, problem: Problem, state: Generation, rng: Streams) -> Generation:
         """Make one generation, all trials from the old population."""
         x, fx = state.x, state.fx
-        population, dimensions = x.shape[1:]
-        u = rng.uniform(population, dimensions + 4)
-        picks = integers(u[..., :4], population - 1, population - 2, population, dimensions)
-        share = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover
+        (picks, taken), *ahead = state.chances or self._draw(state, rng)
         trial = self._change(x, fx, picks)
-        trial *= mutates(u[..., 4:], share, picks[:, 3])  # [dpso2014] eq. 5
+        trial *= taken  # [dpso2014] eq. 5
         trial += x
         press(trial, *problem.limits)
-        return State(*better_of(x, fx, trial, problem.cost(trial)))  # [dpso2014] eq. 6
+        return Generation(*better_of(x, fx, trial, problem.cost(trial)), tuple(ahead))  # [dpso2014] eq. 6
+
+    def _draw(self, state: Generation, rng: Streams) -> tuple[Chance, ...]:
+        """Return partners and crossover of the generations to come."""
+        population, dimensions = state.x.shape[1:]
+        u = drawn(rng, state.fx, population, 4 + dimensions)
+        picks = integers(u[..., :4], population - 1, population - 2, population, dimensions)
+        share = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover
+        taken = mutates(u[..., 4:], share, picks[..., 3, :])
+        partners(picks[..., :2, :])
+        return each(picks[..., :3, :], taken)
 
     def _change(self, x: Float, fx: Float, picks: Int) -> Float:
         """Return what mutation adds to x, [dpso2014] eq. 3 and 4: (base - x) + F (x_n - x_m)."""
-        n, m = partners(picks[:, :2])
-        change = gather(x, n)
-        change -= gather(x, m)
+        change, other, base = apart(x, picks)
+        change -= other
         change *= self.weight
         if self.strategy == "rand/1":
-            change += gather(x, picks[:, 2])
+            change += base
             change -= x
         elif self.strategy == "best/1":
             change += best_of(x, fx)[:, None]

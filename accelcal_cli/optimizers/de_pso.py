@@ -14,33 +14,22 @@ import numpy as np
 
 from accelcal_cli.optimizers.base import (
     OPTIMIZERS,
+    Chance,
     Optimizer,
     State,
     best_of,
     better_of,
-    gather,
+    drawn,
+    each,
     integers,
     partners,
     press,
 )
-from accelcal_cli.optimizers.de import mutates
-from accelcal_cli.optimizers.pso import velocity
+from accelcal_cli.optimizers.de import apart, mutates
+from accelcal_cli.optimizers.pso import pairs, velocity
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Int, Streams
-
-AHEAD = 1600
-"""Points whose chances are drawn at once: several iterations of a small batch. Each run draws its own in the order
-of its iterations, so that they do not depend on its company."""
-
-
-@dataclass(frozen=True)
-class Chances:
-    """What chance decides in K iterations."""
-
-    r: Float  # uniform numbers of the swarm, (R, K, P/2, 2 D)
-    picks: Int  # partners n and m of the individuals, modulo their number, and J_rand, (R, K, 3, P/2)
-    taken: Float  # 1 where a trial takes the mutant's gene, 0 where its parent's, (R, K, P/2, D)
 
 
 @dataclass(frozen=True)
@@ -52,8 +41,9 @@ class HybridState(State):
     memory_cost: Float  # (R, P)
     leader: Float  # common best, (R, D)
     iteration: int
-    ahead: int = 0  # iterations drawn and not yet made, the last of the K
-    chances: Chances | None = None
+    chances: tuple[Chance, ...] = ()
+    """r1 and r2 of the swarm, (R, 2, P/2, D), partners n and m of the individuals, (R, 2, P/2), and 1 where a trial
+    takes the mutant's gene, 0 where its parent's, (R, P/2, D)."""
 
 
 @OPTIMIZERS.register("de-pso")
@@ -89,46 +79,39 @@ class HybridSwarm(Optimizer):
 
     def step(self, problem: Problem, state: HybridState, rng: Streams) -> HybridState:
         """Move both halves once; one call evaluates them together."""
-        ahead, chances = state.ahead, state.chances
-        if chances is None:
-            ahead = max(1, min(AHEAD // state.fx.size, self.iterations - state.iteration))
-            chances = self._draw(state, ahead, rng)
-        x, v = self._moved(problem, state, chances, -ahead)
-        ahead, chances = (ahead - 1, chances) if ahead > 1 else (0, None)
+        now, *ahead = state.chances or self._draw(state, rng)
+        x, v = self._moved(problem, state, now)
         fx = problem.cost(x)
         memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
-        leader, k = best_of(memory, memory_cost), state.iteration + 1
-        return HybridState(x, fx, v, memory, memory_cost, leader, k, ahead, chances)
+        leader = best_of(memory, memory_cost)
+        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1, tuple(ahead))
 
-    def _moved(self, problem: Problem, state: HybridState, chances: Chances, k: int) -> tuple[Float, Float]:
-        """Return both halves' next points and the swarm's velocities by the k-th chances."""
-        x, half, curve = np.empty_like(state.x), state.velocity.shape[1], self._curve(state.iteration)
+    def _moved(self, problem: Problem, state: HybridState, chance: Chance) -> tuple[Float, Float]:
+        """Return both halves' next points and the swarm's velocities."""
+        (r, picks, taken), curve = chance, self._curve(state.iteration)
+        x, half = np.empty_like(state.x), state.velocity.shape[1]
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
-        v = self._velocity(state, chances.r[:, k], curve)
+        v = self._velocity(state, r, curve)
         press(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
-        individuals = state.memory[:, half:].copy(order="K")
-        change = self._change(individuals, state.leader, chances.picks[:, k], curve)
-        change *= chances.taken[:, k]  # [dpso2014] eq. 5
+        individuals = state.memory[:, half:]
+        change = self._change(individuals, state.leader, picks, curve)
+        change *= taken  # [dpso2014] eq. 5
         np.add(individuals, change, out=x[:, half:])
         press(x, low, high)
         return x, v
 
-    def _draw(self, state: HybridState, steps: int, rng: Streams) -> Chances:
-        """Return the chances of the next steps."""
-        runs, population, dimensions = state.x.shape
+    def _draw(self, state: HybridState, rng: Streams) -> tuple[Chance, ...]:
+        """Return what chance decides in the iterations to come."""
+        population, dimensions = state.x.shape[1:]
         half = state.velocity.shape[1]
-        rest, columns = population - half, 3 * dimensions + 3
-        u = rng.uniform(rest, steps * columns).transpose(0, 2, 1).reshape(-1, columns, rest)
-        u = u.transpose(0, 2, 1)
+        rest = population - half
+        u = drawn(rng, state.fx, rest, 3 * dimensions + 3)
         picks = integers(u[..., -3:], rest - 1, rest - 2, dimensions)
-        taken = mutates(u[..., 2 * dimensions : -3], self.crossover, picks[:, 2]).astype(float)
-        partners(picks)
-        r, shape = u[:, :half, : 2 * dimensions], (runs, steps)
-        return Chances(
-            r.reshape(*shape, half, -1), picks.reshape(*shape, 3, rest), taken.reshape(*shape, rest, -1)
-        )
+        taken = mutates(u[..., 2 * dimensions : -3], self.crossover, picks[..., 2, :])
+        partners(picks[..., :2, :])
+        return each(pairs(u[:, :, :half, : 2 * dimensions]), picks[..., :2, :], taken)
 
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
@@ -147,8 +130,8 @@ class HybridSwarm(Optimizer):
         The paper's beta x + (1 - beta) leader is x + (1 - beta) (leader - x).
         """
         own = self.own_max - (self.own_max - self.own_min) * curve  # [dpso2014] eq. 9
-        change = gather(x, picks[:, 0])
-        change -= gather(x, picks[:, 1])
+        change, other = apart(x, picks)
+        change -= other
         change *= self.weight
         pull = leader[:, None] - x
         pull *= 1.0 - own

@@ -72,13 +72,16 @@ class Stopping:
     evaluations: int | None = None
 
 
+NEVER = Stopping()
+
+
 def minimize(
     problem: Problem,
     optimizer: Optimizer,
     *,
     runs: int | Sequence[int] = 1,
     seed: int = 0,
-    stopping: Stopping = Stopping(),
+    stopping: Stopping = NEVER,
     start: Float | None = None,
     trace: bool = True,
     progress: Callable[[int, int], None] | None = None,
@@ -151,8 +154,10 @@ class _Loop:
 
     def _retired(self, state: Any, k: int) -> Any:
         """Return the state without the runs that have ended after k steps."""
+        if state.status is None and self.stopping == NEVER:
+            return state
         checks = self._checks(state)
-        if not checks or not any(which.any() for _, which in checks):
+        if not any(which.any() for _, which in checks):
             return state
         for status, which in checks:
             for i in np.flatnonzero(which):

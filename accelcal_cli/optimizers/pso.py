@@ -8,10 +8,21 @@ is beyond the order-2 stability bound c1 + c2 < 24 (1 - w^2) / (7 - 5 w) = 3.35 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer, State, best_of, better_of, press
+from accelcal_cli.optimizers.base import (
+    OPTIMIZERS,
+    Chance,
+    Optimizer,
+    State,
+    best_of,
+    better_of,
+    drawn,
+    each,
+    press,
+)
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
@@ -25,6 +36,13 @@ class SwarmState(State):
     memory: Float  # pbest, (R, P, D)
     memory_cost: Float  # (R, P)
     leader: Float  # gbest, (R, D)
+    chances: tuple[Chance, ...] = ()  # r1 and r2, (R, 2, P, D)
+
+
+def pairs(u: Float) -> Float:
+    """Return the random numbers of both pulls side by side, shape (R, K, 2, P, D), from u, shape (R, K, P, 2 D)."""
+    runs, steps, population, columns = u.shape
+    return u.swapaxes(2, 3).reshape(runs, steps, 2, columns // 2, population).swapaxes(3, 4)
 
 
 def velocity(
@@ -32,19 +50,23 @@ def velocity(
 ) -> Float:
     """Return the new velocity, [dpso2014] eq. 1, where c1 goes with the global best.
 
-    All of shape (R, P, D), leader (R, D), r uniform of shape (R, P, 2 D).
+    All of shape (R, P, D), leader (R, D), r uniform of shape (R, 2, P, D).
     """
-    dimensions = x.shape[2]
-    pull = leader[:, None] - x
-    pull *= r[..., :dimensions]
-    pull *= c1
-    own = memory - x
-    own *= r[..., dimensions:]
-    own *= c2
-    pull += own
-    np.multiply(v, inertia, out=own)
-    own += pull
-    return own
+    pulls = np.empty_like(r)
+    social, cognitive = pulls[:, 0], pulls[:, 1]
+    np.subtract(leader[:, None], x, out=social)
+    np.subtract(memory, x, out=cognitive)
+    pulls *= r
+    pulls *= _weights(c1, c2)
+    social += cognitive
+    moved = v * inertia
+    moved += social
+    return moved
+
+
+@cache
+def _weights(c1: float, c2: float) -> Float:
+    return np.array([c1, c2])[:, None, None]
 
 
 @OPTIMIZERS.register("pso")
@@ -69,11 +91,7 @@ class ParticleSwarm(Optimizer):
     def step(self, problem: Problem, state: SwarmState, rng: Streams) -> SwarmState:
         """Move the swarm once."""
         x = state.x
-        r = rng.uniform(x.shape[1], 2 * x.shape[2])
-        if self.draws > 1:
-            for _ in range(self.draws - 1):
-                r += rng.uniform(x.shape[1], 2 * x.shape[2])
-            r /= self.draws
+        (r,), *ahead = state.chances or self._draw(state, rng)
         v = velocity(
             x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive
         )
@@ -84,4 +102,13 @@ class ParticleSwarm(Optimizer):
         press(x, low, high)
         fx = problem.cost(x)
         memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)
-        return SwarmState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost))
+        return SwarmState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost), tuple(ahead))
+
+    def _draw(self, state: SwarmState, rng: Streams) -> tuple[Chance, ...]:
+        """Return r1 and r2 of the iterations to come, each the mean of `draws` uniform numbers."""
+        population, dimensions = state.x.shape[1:]
+        u = drawn(rng, state.fx, population, self.draws * 2 * dimensions)
+        if self.draws > 1:
+            parts = u.swapaxes(2, 3).reshape(*u.shape[:2], self.draws, 2 * dimensions, population)
+            u = (np.add.reduce(parts, axis=2) / self.draws).swapaxes(2, 3)
+        return each(pairs(u))

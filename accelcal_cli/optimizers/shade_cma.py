@@ -152,15 +152,13 @@ class ShadeCma(Optimizer):
         capacity = state.archive.shape[1]
         if not capacity:
             return state
-        archive, archived = state.archive.copy(order="K"), state.archived.copy()
-        limit = int(self.archive * state.x.shape[1])
-        for run in range(len(archive)):
-            lost = np.flatnonzero(better[run])
-            slot = archived[run] + np.arange(len(lost))
-            slot = np.where(slot < limit, slot, (u[run, lost] * limit).astype(np.intp))
-            archive[run, slot] = state.x[run, lost]
-            archived[run] = min(limit, archived[run] + len(lost))
-        return replace(state, archive=archive, archived=archived)
+        archive, limit = state.archive.copy(order="K"), int(self.archive * state.x.shape[1])
+        run, lost = np.nonzero(better)
+        count = np.cumsum(better, axis=1)
+        slot = state.archived[run] + count[run, lost] - 1
+        slot = np.where(slot < limit, slot, (u[run, lost] * limit).astype(np.intp))
+        archive[run, slot] = state.x[run, lost]
+        return replace(state, archive=archive, archived=np.minimum(limit, state.archived + count[:, -1]))
 
     def _reduce(self, state: ShadeState) -> ShadeState:
         """Drop the worst individuals down to the size that the evaluations used allow."""

@@ -53,7 +53,8 @@ def choose(names: Sequence[str], config: Path | None, default: Sequence[str], bu
     stated = load_entries(config) if config else {}
     wanted = list(names) or list(stated) or list(default)
     if ALL in wanted:
-        wanted = list(dict.fromkeys([*stated, *OPTIMIZERS.names()]))
+        others = [name for name in wanted if name != ALL]
+        wanted = list(dict.fromkeys([*stated, *OPTIMIZERS.names(), *others]))
     entries = [stated[name] if name in stated else _shipped(name, stated) for name in wanted]
     return [limited(entry, budget) for entry in entries]
 

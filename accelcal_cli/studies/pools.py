@@ -87,20 +87,28 @@ def cluster(address: str) -> Iterator[Executor]:
     """Open a Dask cluster as an executor of the concurrent.futures kind.
 
     Raises:
-        DataError: dask is not installed, nothing answers at the address, no worker is there, one runs another
-            version of accelcal, or the cluster is lost on the way.
+        DataError: dask is not installed, the address is none, nothing answers there, no worker is there, one runs
+            another version of accelcal, or the cluster is lost on the way.
     """
     try:
         import distributed
+        from distributed.comm.addressing import get_address_host_port
         from distributed.scheduler import KilledWorker
     except ImportError:
         raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
     where = f"--cluster {address}"
+    try:
+        # A client with an address that is none fails too, but is heard once more when it is collected.
+        port = get_address_host_port(address)[1]
+    except ValueError as error:
+        raise DataError(f"{where}: expected tcp://host:port ({error})") from None
+    if not 0 < port < 65536:
+        raise DataError(f"{where}: expected tcp://host:port with a port from 1 to 65535")
     connect: Any = distributed.Client
     with _silent("distributed", "distributed.client"):
         try:
             client = connect(address, timeout=ANSWER_TIME, set_as_default=False)
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise DataError(f"{where}: no Dask scheduler answers there ({error})") from None
         with client:
             _check_workers(client, where)

@@ -156,6 +156,7 @@ def test_a_plot_of_costs_that_are_all_zero(run, tmp_path):
     [
         (["--func", "rosenbrok"], 'unknown function "rosenbrok" (did you mean "rosenbrock"?)'),
         (["--optimizer", "pso,psoo"], 'unknown optimizer "psoo" (did you mean "pso"?)'),
+        (["--optimizer", "all,psoo"], 'unknown optimizer "psoo" (did you mean "pso"?)'),
         (["--dim", "1"], "--dim"),
         (["--runs", "0"], "--runs"),
         (["--population", "1"], "pso: population: 1 is too small; expected at least 4"),

@@ -15,8 +15,10 @@ NAMES = OPTIMIZERS.names()
 PAIRS = [(name, case) for name in NAMES for case in contract.cases(OPTIMIZERS.get(name))]
 
 
-def test_the_registry_holds_the_algorithms():
-    assert {"de-pso", "pso", "de", "levenberg-marquardt", "ellipsoid"} <= set(NAMES)
+def test_the_registry_holds_the_methods_of_the_papers():
+    """The names are a contract."""
+    evolving = {"de-pso", "pso", "de", "ade", "shade-cma", "kpso", "akpso", "foa", "full-foa", "ifoa"}
+    assert evolving | {"levenberg-marquardt", "newton", "ellipsoid"} <= set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)

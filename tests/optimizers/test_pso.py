@@ -13,7 +13,7 @@ from known_problems import ShiftedSphere, Watched
 
 from accelcal_cli.optimizers.base import better_of
 from accelcal_cli.optimizers.minimize import minimize
-from accelcal_cli.optimizers.pso import ParticleSwarm, velocity
+from accelcal_cli.optimizers.pso import ParticleSwarm, pairs, velocity
 from accelcal_cli.streams import Streams
 
 
@@ -23,7 +23,8 @@ def test_velocity_is_equation_1(seed, w, c1, c2):
     runs, population, dimensions = 2, 5, 3
     rng = Streams(seed, range(runs))
     x, v, memory = (rng.normal(population, dimensions) for _ in range(3))
-    leader, r = rng.normal(1, dimensions)[:, 0], rng.uniform(population, 2 * dimensions)
+    leader = rng.normal(1, dimensions)[:, 0]
+    r = pairs(rng.uniform(population, 2 * dimensions)[:, None])[:, 0]
     before = [a.copy() for a in (x, v, memory, leader, r)]
     got = velocity(x, v, memory, leader, r, w, c1, c2)
     for run in range(runs):
@@ -31,8 +32,8 @@ def test_velocity_is_equation_1(seed, w, c1, c2):
             for d in range(dimensions):
                 expected = (
                     w * v[run, i, d]
-                    + c1 * r[run, i, d] * (leader[run, d] - x[run, i, d])
-                    + c2 * r[run, i, dimensions + d] * (memory[run, i, d] - x[run, i, d])
+                    + c1 * r[run, 0, i, d] * (leader[run, d] - x[run, i, d])
+                    + c2 * r[run, 1, i, d] * (memory[run, i, d] - x[run, i, d])
                 )
                 assert got[run, i, d] == pytest.approx(expected, rel=1e-12, abs=1e-12)
     for old, new in zip(before, (x, v, memory, leader, r), strict=True):

@@ -187,6 +187,13 @@ def test_a_cluster_that_does_not_answer(monkeypatch):
         pass
 
 
+@pytest.mark.parametrize("address", ["", "nowhere", "tcp://host:", "http://host:8786", "host:0", "host:65536"])
+def test_a_cluster_address_that_is_none(address):
+    pytest.importorskip("distributed")
+    with pytest.raises(DataError, match="expected tcp://host:port"), pools.cluster(address):
+        pass
+
+
 def test_a_cluster_without_dask(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(DataError, match=r"pip install 'accelcal\[cluster\]'"), pools.cluster("tcp://a:1"):
