@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raw_logs import G, opened, simulated, text
+from simulated import MEMS, noise
 
 from accelcal_cli.calibration.attitudes import attitudes
 from accelcal_cli.calibration.detection import MULTIPLIERS, TIE, DetectSettings, detect
@@ -17,8 +19,6 @@ from accelcal_cli.sensor.poses import fibonacci
 from accelcal_cli.sensor.rawlog import open_raw_log
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.sensor.spans import Span, Spans
-from tests.sensor.raw_logs import G, opened, simulated, text
-from tests.simulated import MEMS, noise
 
 XSENS = ErrorModel(
     np.array([[414.441645, 0, 0], [1.477289, 412.122680, 0], [3.832964, 8.841874, 414.507889]]),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raw_logs import opened, simulated, text
 
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.rawlog import Clock
-from tests.sensor.raw_logs import opened, simulated, text
 
 LOG, _ = simulated(2, hold=4.0)
 A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]

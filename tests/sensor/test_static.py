@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from raw_logs import in_blocks, simulated
 
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.envelope import MOST, Envelope
@@ -15,7 +16,6 @@ from accelcal_cli.sensor.intervals import Intervals, find_intervals, merge
 from accelcal_cli.sensor.spans import Rows, Span, Spans, parse_span
 from accelcal_cli.sensor.static import find_level, windows
 from accelcal_cli.sensor.tiles import Tiles
-from tests.sensor.raw_logs import in_blocks, simulated
 
 ROWS = Rows(tile=10, width=10, still=None, least=100, trim=50)
 
