@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from accelcal_cli.calibration.candidates import Candidate
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.intervals import Found
 from accelcal_cli.sensor.spans import Rows
 from accelcal_cli.sensor.static import Level
-
-if TYPE_CHECKING:
-    from accelcal_cli.calibration.detection import Candidate
 
 MOVING = 0.05
 """A quietest window that scatters by more than this part of the range of the readings is not still."""

@@ -8,7 +8,8 @@ from raw_logs import G, opened, simulated, text
 from simulated import MEMS, noise
 
 from accelcal_cli.calibration.attitudes import attitudes
-from accelcal_cli.calibration.detection import MULTIPLIERS, TIE, DetectSettings, detect
+from accelcal_cli.calibration.candidates import TIE
+from accelcal_cli.calibration.detection import MULTIPLIERS, DetectSettings, detect
 from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.weighting import shared_variance, shared_weights
