@@ -155,7 +155,7 @@ def test_attitudes_go_to_the_longest_pose():
         (
             DetectSettings(spans=Spans(least=Span(30.0))),
             14,
-            "0 still poses .*14 stretches.*hold each pose longer",
+            "no still pose, 12 are needed.*14 stretches.*hold each pose longer",
         ),
         (DetectSettings(least_poses=13, multipliers=(5.0,)), 12, "12 still poses.*multiplier 5"),
     ],
@@ -179,6 +179,35 @@ def test_a_log_that_never_rests_is_told_so():
     moving = 9 * np.sin(t * [1.0, 1.3, 1.7]) + np.sin(40 * t)
     with pytest.raises(DataError, match="no part of the log is still"):
         detected(moving, names="ax,ay,az")
+
+
+def moving(seconds, speed, noise):
+    """Readings in m/s^2 at 100 Hz, shape (n, 3), of a sensor that turns without a rest."""
+    t = np.arange(100.0 * seconds)[:, None] / 100
+    u = np.sin(speed * t * [0.9, 1.3, 1.1] + [0.0, 1.0, 2.0])
+    return G * u / np.linalg.norm(u, axis=1, keepdims=True) + noise * np.random.default_rng(1).normal(
+        size=u.shape
+    )
+
+
+@pytest.mark.parametrize(
+    ("speed", "noise", "said"),
+    [(1.0, 0.5, "no part of the log is still"), (0.03, 0.05, r"turns while they last.*put the sensor down")],
+)
+def test_turning_is_no_pose_however_slow_or_noisy(speed, noise, said):
+    with pytest.raises(DataError, match=said):
+        detected(moving(300, speed, noise), names="ax,ay,az")
+
+
+def test_a_vibration_is_no_motion():
+    """A fan of 23 Hz and 3 m/s^2: the poses are there, and their scatter says what they are worth."""
+    numbers, holds = simulated(16, seed=3)
+    numbers[:, :3] += 1670 * 3 * np.sin(2 * np.pi * 23.3 * numbers[:, -1:] + [0.0, 1.0, 2.0])
+    found = detected(numbers)
+    assert len(found.intervals) == len(holds)
+    result = calibrate(found.readings(), Settings(g=G, weights="auto"))
+    assert result.verdict == "good"
+    assert_within(result, load_sensor("mems").model.in_gauge("lower"), 4.0)
 
 
 def test_fewer_poses_may_be_accepted():
