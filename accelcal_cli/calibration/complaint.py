@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from accelcal_cli.calibration.candidates import Candidate
-from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.intervals import Found, Ints
 from accelcal_cli.sensor.spans import Rows
 from accelcal_cli.sensor.static import Level
@@ -17,24 +16,28 @@ MOVING = 0.05
 """A quietest window that scatters by more than this part of the range of the readings is not still."""
 
 
-def too_few(
-    name: str, found: Sequence[Found], candidates: Sequence[Candidate], level: Level, rows: Rows, least: int
-) -> DataError:
-    """Return the error of a log in which no multiplier finds `least` attitudes."""
-    best = max(
+def nearest(found: Sequence[Found], candidates: Sequence[Candidate]) -> int:
+    """Return which of several multipliers comes nearest to poses enough."""
+    return max(
         range(len(found)), key=lambda k: (candidates[k].attitudes, candidates[k].poses, len(found[k].turning))
     )
+
+
+def too_few(
+    found: Sequence[Found], candidates: Sequence[Candidate], level: Level, rows: Rows, least: int
+) -> str:
+    """Say why no multiplier finds `least` attitudes, and what would help."""
+    best = nearest(found, candidates)
     seen, count = found[best], candidates[best]
     threshold = seen.multiplier * level.variance
     poses, alike = _counted(count.poses, "still pose"), _counted(count.attitudes, "attitude")
-    have = f"{poses} in {alike}, fewer than {least}" if count.poses else f"no still pose, {least} are needed"
     parts = [
-        f"{name}: {have}",
+        f"{poses} in {alike}, fewer than {least}" if count.poses else f"no still pose, {least} are needed",
         f"quietest variance {level.quietest:.4g}, threshold {threshold:.4g} (multiplier {seen.multiplier:g})",
         _lengths(seen, rows),
         _advice(seen, count, level, rows, [f.multiplier for f in found], least),
     ]
-    return DataError("; ".join(parts))
+    return "; ".join(parts)
 
 
 def _counted(number: int, what: str) -> str:

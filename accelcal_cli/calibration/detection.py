@@ -8,8 +8,9 @@ import numpy as np
 
 from accelcal_cli.calibration.attitudes import attitudes, directions_of
 from accelcal_cli.calibration.candidates import Candidate, best, judge, readings_of
-from accelcal_cli.calibration.complaint import too_few
+from accelcal_cli.calibration.complaint import nearest, too_few
 from accelcal_cli.calibration.screening import screen
+from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.envelope import Envelope
 from accelcal_cli.sensor.intervals import Intervals, find_intervals, merge
 from accelcal_cli.sensor.rawlog import RawLog
@@ -90,6 +91,15 @@ class Detection:
         )
 
 
+class TooFewPosesError(DataError):
+    """No multiplier finds attitudes enough; `found` is what the one that comes nearest finds."""
+
+    def __init__(self, message: str, found: Detection) -> None:
+        """Keep what was found, for a picture."""
+        super().__init__(message)
+        self.found = found
+
+
 def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Detection:
     """Find the static poses of a raw log in one pass.
 
@@ -98,7 +108,8 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     Of those that come within 5 % of it the smallest multiplier is kept.
 
     Raises:
-        UsageError: lengths that do not fit the log. DataError: unreadable, or too few poses; it says what was seen.
+        UsageError: lengths that do not fit the log. DataError: unreadable.
+        TooFewPosesError: it says what was seen.
     """
     rate = settings.rate if settings.rate is not None else log.clock.rate
     rows = settings.spans.rows(rate)
@@ -108,10 +119,9 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     found = find_intervals(tiles, rows, level, settings.multipliers)
     candidates = tuple(judge(f, settings.g) for f in found)
     enough = [k for k, c in enumerate(candidates) if c.attitudes >= settings.least_poses]
-    if not enough:
-        raise too_few(log.name, found, candidates, level, rows, settings.least_poses)
-    kept = best(enough, candidates)
-    return Detection(
+    kept = best(enough, candidates) if enough else nearest(found, candidates)
+    intervals = found[kept].intervals
+    detection = Detection(
         source=log.name,
         sha256=log.sha256,
         columns=log.columns.names,
@@ -121,11 +131,15 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         level=level,
         multiplier=candidates[kept].multiplier,
         candidates=candidates,
-        intervals=_thinned(found[kept].intervals, settings),
+        intervals=_thinned(intervals, settings) if enough else intervals,
         settings=settings,
         notes=tuple(log.notes),
         envelope=envelope,
     )
+    if not enough:
+        why = too_few(found, candidates, level, rows, settings.least_poses)
+        raise TooFewPosesError(f"{log.name}: {why}", detection)
+    return detection
 
 
 def _thinned(intervals: Intervals, settings: DetectSettings) -> Intervals:

@@ -122,6 +122,17 @@ def test_a_picture_of_the_log(run, log, suffix):
         assert b"static pose" in first
 
 
+def test_a_picture_shows_why_detection_failed(run, log):
+    pytest.importorskip("matplotlib")
+    failed = run("detect", log, "--min-poses", "15", "--plot", "log.svg", "-o", "out.csv")
+    assert failed.code == 2
+    assert failed.err.startswith("accelcal: wrote log.svg\naccelcal: raw.csv: 14 still poses")
+    assert "14 static poses" in Path("log.svg").read_text()
+    assert not Path("out.csv").exists()
+    assert run("detect", log, "--min-length", "60", "--plot", "none.svg", "-q").err.count("\n") == 1
+    assert "0 static poses" in Path("none.svg").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
