@@ -11,7 +11,7 @@ from accelcal_cli.calibration.report_tables import headline, pose_residuals
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.config import dump
 from accelcal_cli.errors import UsageError
-from accelcal_cli.output import pictures
+from accelcal_cli.output import pictures, sphere
 from accelcal_cli.table import Table
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def _pictures(result: Calibration) -> dict[str, Any]:
         name: Markup(draw(result))
         for name, draw in (
             ("residuals", pictures.residuals),
-            ("sphere", pictures.sphere),
+            ("sphere", sphere.sphere),
             ("convergence", pictures.convergence),
             ("dilution", pictures.dilution),
         )
