@@ -65,6 +65,18 @@ def test_raw_is_detect_and_calibrate_in_one(run, log):
     assert np.abs(away[lower] / np.array(one["sigma"]["K_a"])[lower]).max() < 4
 
 
+def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
+    said = "each row is taken for a pose at rest; if these"
+    plain = run("calibrate", log, "--optimizer", "ellipsoid", "-o", "wrong.yaml")
+    assert said in plain.out.replace("\n", " ")
+    assert said not in run("calibrate", log, "--raw", "--optimizer", "ellipsoid").out.replace("\n", " ")
+    assert run("verify", "wrong.yaml", log).err.startswith(f"accelcal: raw.csv: {said}")
+    assert run("plan", log).err.startswith(f"accelcal: raw.csv: {said}")
+    assert run("detect", log, "-o", "poses.csv").code == 0
+    assert said not in run("calibrate", "poses.csv", "--optimizer", "ellipsoid").out.replace("\n", " ")
+    assert run("plan", "poses.csv").err == ""
+
+
 def test_weights_of_a_raw_log_can_be_stated(run, log):
     Path("plain.yaml").write_text("weights: none\n")
     for arguments in (["--weights", "none"], ["--config", "plain.yaml"]):

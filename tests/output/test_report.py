@@ -218,7 +218,7 @@ def test_text_of_the_result_is_not_taken_for_html(good):
 def browser():
     path = chromium.browser()
     if path is None:
-        pytest.skip("no chromium and chromedriver here")
+        pytest.skip("no chromium and chromedriver here: apt-get install chromium chromium-driver")
     with chromium.session(path) as found:
         yield found
 
