@@ -55,6 +55,6 @@ class Table:
 
     def filled(self) -> Table:
         """Return the table without the columns that hold nothing in any row."""
-        keep = [i for i in range(len(self.columns)) if any(row[i] is not None for row in self.rows)]
+        keep = [i for i in range(len(self.columns)) if any(row[i] not in (None, "") for row in self.rows)]
         rows = tuple([row[i] for i in keep] for row in self.rows)
         return replace(self, columns=tuple(self.columns[i] for i in keep), rows=rows)

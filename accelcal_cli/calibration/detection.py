@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from accelcal_cli.calibration.attitudes import attitudes, directions_of
-from accelcal_cli.calibration.complaint import too_few
+from accelcal_cli.calibration.candidates import Candidate, best, judge, readings_of
+from accelcal_cli.calibration.complaint import nearest, too_few
 from accelcal_cli.calibration.screening import screen
+from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.envelope import Envelope
-from accelcal_cli.sensor.intervals import Found, Intervals, find_intervals, merge
+from accelcal_cli.sensor.intervals import Intervals, find_intervals, merge
 from accelcal_cli.sensor.rawlog import RawLog
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.sensor.spans import Rows, Spans
@@ -20,14 +22,6 @@ from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
 """Tried when none is stated; [tedaldi2014] tries 2 to 10 times the variance of a marked still period."""
-
-DISTINCT = 5.0
-"""Degrees between attitudes that count as two."""
-
-TIE = 1.05
-"""Sigmas up to this factor apart are the same: the smallest multiplier, the stillest poses, then decides."""
-
-ORDER = ("good", "weak", "undetermined")
 
 
 @dataclass(frozen=True)
@@ -39,7 +33,7 @@ class DetectSettings:
         rate: rows a second, Hz; that of the time column when None.
         multipliers: of the level; the best one is kept.
         merge: poses within this angle become one, degrees; thin: only the longest of them stays, degrees.
-        least_poses: attitudes that must be found, DISTINCT degrees apart.
+        least_poses: attitudes that must be found, candidates.DISTINCT degrees apart.
         g: local gravity, m/s^2.
     """
 
@@ -50,25 +44,6 @@ class DetectSettings:
     thin: float | None = None
     least_poses: int = 12
     g: float = STANDARD_GRAVITY
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """What a multiplier leads to.
-
-    Attributes:
-        multiplier: of the level; poses: intervals found; attitudes: how many of them differ.
-        rms: of |f| - g of a calibration with them, m/s^2; NaN where there are too few.
-        sigma: of its worst parameter, as m/s^2 at 1 g, as if each attitude counted once; inf where there are too few.
-        verdict: good, weak or undetermined.
-    """
-
-    multiplier: float
-    poses: int
-    attitudes: int
-    rms: float = float("nan")
-    sigma: float = float("inf")
-    verdict: str = "undetermined"
 
 
 @dataclass(frozen=True)
@@ -100,7 +75,7 @@ class Detection:
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
         notes = (*self.notes, self.summary())
-        return _readings(self.intervals, self.source).known_as(
+        return readings_of(self.intervals, self.source).known_as(
             self.sha256, self.columns, notes, self.intervals.where
         )
 
@@ -116,6 +91,15 @@ class Detection:
         )
 
 
+class TooFewPosesError(DataError):
+    """No multiplier finds attitudes enough; `found` is what the one that comes nearest finds."""
+
+    def __init__(self, message: str, found: Detection) -> None:
+        """Keep what was found, for a picture."""
+        super().__init__(message)
+        self.found = found
+
+
 def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Detection:
     """Find the static poses of a raw log in one pass.
 
@@ -124,7 +108,8 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     Of those that come within 5 % of it the smallest multiplier is kept.
 
     Raises:
-        UsageError: lengths that do not fit the log. DataError: unreadable, or too few poses; it says what was seen.
+        UsageError: lengths that do not fit the log. DataError: unreadable.
+        TooFewPosesError: it says what was seen.
     """
     rate = settings.rate if settings.rate is not None else log.clock.rate
     rows = settings.spans.rows(rate)
@@ -132,12 +117,11 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     tiles = read_tiles(log, rows.tile, envelope)
     level = find_level(tiles, rows, log.name)
     found = find_intervals(tiles, rows, level, settings.multipliers)
-    candidates = tuple(_judge(f, settings) for f in found)
+    candidates = tuple(judge(f, settings.g) for f in found)
     enough = [k for k, c in enumerate(candidates) if c.attitudes >= settings.least_poses]
-    if not enough:
-        raise too_few(log.name, found, candidates, level, rows, settings.least_poses)
-    best = _best(enough, candidates)
-    return Detection(
+    kept = best(enough, candidates) if enough else nearest(found, candidates)
+    intervals = found[kept].intervals
+    detection = Detection(
         source=log.name,
         sha256=log.sha256,
         columns=log.columns.names,
@@ -145,45 +129,17 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         rate=rate,
         rows=rows,
         level=level,
-        multiplier=candidates[best].multiplier,
+        multiplier=candidates[kept].multiplier,
         candidates=candidates,
-        intervals=_thinned(found[best].intervals, settings),
+        intervals=_thinned(intervals, settings) if enough else intervals,
         settings=settings,
         notes=tuple(log.notes),
         envelope=envelope,
     )
-
-
-def _best(enough: list[int], candidates: tuple[Candidate, ...]) -> int:
-    """Return the number of the candidate to keep: best verdict, then least sigma, then stillest poses."""
-    verdict = min(ORDER.index(candidates[k].verdict) for k in enough)
-    enough = [k for k in enough if candidates[k].verdict == ORDER[verdict]]
-    least = min(candidates[k].sigma for k in enough)
-    return min(
-        (k for k in enough if candidates[k].sigma <= TIE * least), key=lambda k: candidates[k].multiplier
-    )
-
-
-def _judge(found: Found, settings: DetectSettings) -> Candidate:
-    """Calibrate with what a multiplier found."""
-    intervals = found.intervals
-    seen = Candidate(found.multiplier, len(intervals), min(len(intervals), 1))
-    if len(intervals) < 2 or not np.ptp(intervals.mean, axis=0).any():
-        return seen
-    fit = screen(_readings(intervals, "log"), settings.g)
-    distinct = len(attitudes(directions_of(intervals.mean, fit.model), intervals.n, DISTINCT))
-    sigma = fit.s * fit.dop * np.sqrt(len(intervals) / distinct)
-    return replace(
-        seen,
-        attitudes=distinct,
-        rms=fit.rms,
-        sigma=float(sigma) if np.isfinite(sigma) else float("inf"),
-        verdict=fit.verdict,
-    )
-
-
-def _readings(intervals: Intervals, source: str) -> Readings:
-    return Readings.from_array(intervals.mean, source=source, count=intervals.n, scatter=intervals.scatter)
+    if not enough:
+        why = too_few(found, candidates, level, rows, settings.least_poses)
+        raise TooFewPosesError(f"{log.name}: {why}", detection)
+    return detection
 
 
 def _thinned(intervals: Intervals, settings: DetectSettings) -> Intervals:
@@ -191,7 +147,7 @@ def _thinned(intervals: Intervals, settings: DetectSettings) -> Intervals:
     angle = settings.merge if settings.merge is not None else settings.thin
     if angle is None:
         return intervals
-    model = screen(_readings(intervals, "log"), settings.g).model
+    model = screen(readings_of(intervals, "log"), settings.g).model
     groups = attitudes(directions_of(intervals.mean, model), intervals.n, angle)
     if settings.merge is None:
         return intervals.take(np.sort(np.array([group[0] for group in groups])))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from accelcal_cli.calibration.plan import KINDS
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.sensor.poses import AXES
 from accelcal_cli.table import Column, Table
@@ -26,6 +27,17 @@ def pose_residuals(result: Calibration) -> Table:
     )
     notes = ("Before, after: |f| - g. x, y, z: unit direction of the specific force, gauge lower.",)
     return Table("Poses", columns, rows, notes)
+
+
+def accuracy(result: Calibration) -> str:
+    """Say in one sentence how well the parameters are known; nothing where the poses do not tell."""
+    variance = np.diagonal(result.covariance)
+    if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(variance).all():
+        return ""
+    sigma = np.sqrt(variance) / result.g
+    largest = [(name, sigma[kind].max() * size, unit) for name, kind, unit, size in KINDS]
+    parts = [f"{name} {value:{'.2g' if value < 100 else ',.0f'}} {unit}" for name, value, unit in largest]
+    return f"Largest one-sigma of each kind: {', '.join(parts)}."
 
 
 def headline(result: Calibration) -> list[tuple[str, str]]:

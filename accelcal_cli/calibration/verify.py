@@ -13,20 +13,17 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration import chances
 from accelcal_cli.calibration import record as records
-from accelcal_cli.calibration.chances import Noise, Pair
+from accelcal_cli.calibration.chances import Pair
 from accelcal_cli.calibration.quality import PARAMETERS
 from accelcal_cli.calibration.residuals import modulus_errors, square_error
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.shift import Shift, shift
 from accelcal_cli.calibration.temperature import at
+from accelcal_cli.calibration.tested import Tests
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Float
 
 SCHEMA = "accelcal/verification/1"
-
-ROUNDING = 1e-9
-"""Noise below this part of g is rounding: nothing is judged by less."""
 
 
 @dataclass(frozen=True)
@@ -119,36 +116,23 @@ def verify(
     """
     _check(old)
     readings, warmth = _at_reference(old, readings)
-    model = old.model.in_gauge("lower")
     found = shift(old, readings)
-    floor = (ROUNDING * old.g) ** 2
-    pair = Pair.of(
-        Noise(max(old.s**2, floor), old.freedom), Noise(max(found.noise.variance, floor), found.noise.freedom)
-    )
-    A = old.covariance / old.s**2
-    V = found.basis.T @ (pair.a.variance * A + pair.b.variance * found.cofactor) @ found.basis
-    d = found.basis.T @ found.value
-    together = pair.chance(d, found.basis.T @ A @ found.basis, found.basis.T @ found.cofactor @ found.basis)
-    single = np.array(
-        [pair.chance(found.value[[p]], A[[p]][:, [p]], found.cofactor[[p]][:, [p]]) for p in range(9)]
-    )
-    chance = chances.combined(np.append(single[found.known], together))
-    squares = sum(square_error(e, old.g) for _, e, _ in modulus_errors(readings, model, old.g))
-    verdict = "changed" if chance < level else "unchanged"
-    differences = _differences(found, pair, A, single, level if verdict == "changed" else 0.0)
+    tests = Tests.of(old, found)
+    verdict = "changed" if tests.chance < level else "unchanged"
+    differences = _differences(found, tests, level if verdict == "changed" else 0.0)
     return Verification(
         verdict=verdict,
-        reasons=(*_reasons(verdict, differences, found, pair, level), *warmth),
-        chance=chance,
+        reasons=(*_reasons(verdict, differences, found, tests.pair, level), *warmth),
+        chance=tests.chance,
         level=level,
-        chi_square=float(d @ np.linalg.solve(V, d)),
+        chi_square=tests.chi_square,
         directions=found.basis.shape[1],
-        chance_together=together,
+        chance_together=tests.together,
         differences=differences,
         s_old=old.s,
         s_new=float(np.sqrt(found.noise.variance)) if found.noise.freedom else float("nan"),
-        noise_chance=pair.noise_chance(),
-        rms=float(np.sqrt(squares / readings.poses)),
+        noise_chance=tests.pair.noise_chance(),
+        rms=_rms(old, readings),
         tolerance=tolerance,
         poses=readings.poses,
         freedom=found.noise.freedom,
@@ -157,6 +141,13 @@ def verify(
         result=dict(old.data),
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
     )
+
+
+def _rms(old: Calibration, readings: Readings) -> float:
+    """Return the rms of |f| - g of the readings under the old result, in its unit of force."""
+    model = old.model.in_gauge("lower")
+    squares = sum(square_error(e, old.g) for _, e, _ in modulus_errors(readings, model, old.g))
+    return float(np.sqrt(squares / readings.poses))
 
 
 def _check(old: Calibration) -> None:
@@ -183,12 +174,11 @@ def _at_reference(old: Calibration, readings: Readings) -> tuple[Readings, tuple
     return at(readings, brought), ()
 
 
-def _differences(found: Shift, pair: Pair, A: Float, single: Float, level: float) -> tuple[Difference, ...]:
+def _differences(found: Shift, tests: Tests, level: float) -> tuple[Difference, ...]:
     adjusted = np.full(9, np.nan)
-    adjusted[found.known] = chances.holm(single[found.known])
-    variance = np.diagonal(pair.a.variance * A + pair.b.variance * found.cofactor)
-    sigma = np.where(found.known, np.sqrt(variance), np.nan)
-    value, alone = np.where(found.known, [found.value, single], np.nan)
+    adjusted[found.known] = chances.holm(tests.single[found.known])
+    sigma = np.where(found.known, np.sqrt(np.diagonal(tests.covariance)), np.nan)
+    value, alone = np.where(found.known, [found.value, tests.single], np.nan)
     return tuple(
         Difference(
             name,

@@ -7,10 +7,7 @@ from accelcal_cli.calibration.verify import Difference, Verification
 from accelcal_cli.sensor import units
 from accelcal_cli.table import Column, Table
 
-
-def tables(result: Verification) -> list[Table]:
-    """Return every table of a verification, in reading order."""
-    return [differences(result), tests(result)]
+MICRO_RAD = 1000.0 * units.MRAD
 
 
 def differences(result: Verification) -> Table:
@@ -37,13 +34,13 @@ def _row(d: Difference, result: Verification) -> tuple[object, ...]:
     if d.name in PARAMETERS[SCALE]:
         factor, unit = -units.PPM / result.g, "ppm"
     elif d.name in PARAMETERS[MISALIGNMENT]:
-        factor, unit = -units.MRAD / result.g, "mrad"
+        factor, unit = -MICRO_RAD / result.g, "micro-rad"
     else:
         factor, unit = units.MICRO_G / result.g, "micro-g"
     if d.value != d.value:
         return (d.name, None, None, unit, None, None, "not determined")
     changed = "changed" if d.changed else ""
-    return (d.name, d.value * factor, d.sigma * abs(factor), unit, d.chance, d.adjusted, changed)
+    return (d.name, d.value * factor + 0.0, d.sigma * abs(factor), unit, d.chance, d.adjusted, changed)
 
 
 def tests(result: Verification) -> Table:

@@ -45,6 +45,7 @@ def command(
     Prints the poses, and with -o writes them as the CSV file that `calibrate` reads. Several thresholds are tried,
     and the one is kept whose poses calibrate best. `calibrate --raw` does both in one.
     """
+    from accelcal_cli.calibration.detection import TooFewPosesError
     from accelcal_cli.output.files import check_target
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
@@ -70,8 +71,23 @@ def command(
         min_poses=min_poses,
     )
     local_g = options.gravity(g, latitude, height) or STANDARD_GRAVITY
-    found = detecting.find_poses(data, columns, chosen, local_g, picture=plot is not None)
+    try:
+        found = detecting.find_poses(data, columns, chosen, local_g, picture=plot is not None)
+    except TooFewPosesError as failure:
+        _draw(failure.found, plot, quiet)
+        raise
     _show(found, format, output, plot, quiet)
+
+
+def _draw(found: Detection, plot: str | None, quiet: bool) -> None:
+    """Draw the log where a picture is asked for."""
+    if plot is None:
+        return
+    from accelcal_cli.output.logplot import plot_log
+
+    plot_log(found, plot)
+    if not quiet:
+        typer.echo(f"accelcal: wrote {plot}", err=True)
 
 
 def _show(found: Detection, format: str, output: str | None, plot: str | None, quiet: bool) -> None:
@@ -83,10 +99,6 @@ def _show(found: Detection, format: str, output: str | None, plot: str | None, q
     if output is not None:
         with whole_file(output) as file:
             write_csv(poses_table(found), file)
-    if plot is not None:
-        from accelcal_cli.output.logplot import plot_log
-
-        plot_log(found, plot)
     if format == "json":
         sys.stdout.write(json_text(record(found)))
     elif format == "csv":
@@ -96,6 +108,6 @@ def _show(found: Detection, format: str, output: str | None, plot: str | None, q
 
         show_detection(found)
     sys.stdout.flush()
-    for path in (output, plot):
-        if path not in (None, "-") and not quiet:
-            typer.echo(f"accelcal: wrote {path}", err=True)
+    if output not in (None, "-") and not quiet:
+        typer.echo(f"accelcal: wrote {output}", err=True)
+    _draw(found, plot, quiet)

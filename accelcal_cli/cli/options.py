@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from accelcal_cli.errors import UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    from accelcal_cli.sensor.readings import Readings
 
 FORMATS = ("table", "json", "csv")
 
@@ -63,6 +66,15 @@ def gravity(g: float | None, latitude: float | None, height: float | None) -> fl
     if g is not None:
         return check_gravity(g)
     return None if latitude is None else normal_gravity(latitude, height or 0.0)
+
+
+def warn_of_moves(readings: Readings) -> None:
+    """Say on standard error when readings look like a raw log, for commands that do not show the notes."""
+    from accelcal_cli.sensor.collect import EACH_ROW
+
+    for note in readings.notes:
+        if note.startswith(EACH_ROW):
+            typer.echo(f"accelcal: {readings.source}: {note}", err=True)
 
 
 def check_tolerance(tolerance: float | None) -> None:

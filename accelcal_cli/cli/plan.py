@@ -96,7 +96,9 @@ def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
         return load_result(data)
     options.check_input(data)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
-    return calibrate(read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer), settings)
+    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+    options.warn_of_moves(readings)
+    return calibrate(readings, settings)
 
 
 def _plan(

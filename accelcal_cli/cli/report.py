@@ -36,7 +36,8 @@ def command(
     check_target(output)
     check_packages()
     found = load_result(result)
-    text = page(found, title or f"Calibration of {found.data.get('source', result)}")
+    source = Path(str(found.data.get("source", result))).name
+    text = page(found, title or f"Calibration of {source}")
     with whole_file(output) as file:
         file.write(text)
     if not quiet and output != "-":

@@ -19,6 +19,7 @@ def show_detection(found: Detection) -> None:
     if len(poses.rows) > MOST:
         note = f"{len(poses.rows) - MOST:,} more poses are not shown; -o writes them all"
         poses = replace(poses, rows=poses.rows[:MOST], notes=(note,))
-    rich_console.show([poses, candidates_table(found)], out)
+    for table in (poses, candidates_table(found)):
+        rich_console.show_split(table, out)
     for note in (*found.notes, found.summary()):
         out.print(f"Note: {note}")

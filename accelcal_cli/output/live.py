@@ -70,7 +70,7 @@ class Watch:
         return f"pose {len(self.capture.taken)}: {name}; {pose.n} readings, sd {spread:.3g}; {left} to take"
 
     def _drawn(self) -> Group:
-        """Return the poses with what has become of them, and what is held now."""
+        """Return what is held now, which a low terminal must not cut off, and what has become of the poses."""
         numbers = {index: j + 1 for j, index in enumerate(self.capture.recognised()) if index is not None}
         near = None if self.status is None or self.status.angle > NEAR else self.status.nearest
         lines = []
@@ -82,13 +82,18 @@ class Watch:
         beside = self.capture.recognised().count(None)
         if beside:
             lines.append(Text(f"       and {beside} beside the plan, kept"))
-        return Group(*lines, self._now())
+        return Group(*self._now(), Text(f"{len(numbers)} of {len(self.capture.planned)} taken:"), *lines)
 
-    def _now(self) -> Text:
+    def _now(self) -> list[Text]:
         if self.status is None:
-            return Text("waiting for readings")
+            return [Text("waiting for readings"), Text("")]
         now, filled = self.status, round(BAR * self.status.progress)
         bar = "#" * filled + "." * (BAR - filled)
+        state = f"[{bar}] {WORDS[now.state]}"
         held = f"{now.angle:.0f} degrees from {describe(self.capture.planned[now.nearest])}"
-        words = f"{WORDS[now.state]}  [{bar}]  {held}  sd {now.spread:.3g} (still: {now.limit:.3g})"
-        return Text(words, STYLES[now.state])
+        return [
+            Text(state, STYLES[now.state]),
+            Text(
+                f"{held}; sd {now.spread:.2g}, still below {now.limit:.2g}", overflow="ellipsis", no_wrap=True
+            ),
+        ]

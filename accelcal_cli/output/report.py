@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from accelcal_cli import __version__
 from accelcal_cli.calibration import tables
-from accelcal_cli.calibration.report_tables import headline, pose_residuals
+from accelcal_cli.calibration.report_tables import accuracy, headline, pose_residuals
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.config import dump
 from accelcal_cli.errors import UsageError
-from accelcal_cli.output import pictures
+from accelcal_cli.output import pictures, sphere
 from accelcal_cli.table import Table
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 NEEDS = ("jinja2", "matplotlib")
 TEMPLATE = "report.html.jinja"
+RAISED = (("m/s^2", "m/s\u00b2"), (")^4", ")\u2074"), ("(g)\u2074", "g\u2074"))
 
 
 def check_packages() -> None:
@@ -34,16 +35,17 @@ def page(result: Calibration, title: str) -> str:
         result: what is reported.
         title: heading of the page.
     """
-    return (
+    text = (
         _environment()
         .get_template(TEMPLATE)
         .render(
             result=result,
             title=title,
+            accuracy=accuracy(result),
             headline=headline(result),
             parameters=_parameters(result),
             fit=tables.fit(result),
-            worst=tables.worst_poses(result),
+            worst=tables.worst_poses(result).filled(),
             poses=pose_residuals(result),
             observability=tables.observability(result),
             pictures=_pictures(result),
@@ -51,6 +53,14 @@ def page(result: Calibration, title: str) -> str:
             origin=_origin(result),
         )
     )
+    return typeset(text)
+
+
+def typeset(text: str) -> str:
+    """Return text with the powers of units raised."""
+    for plain, raised in RAISED:
+        text = text.replace(plain, raised)
+    return text
 
 
 def _parameters(result: Calibration) -> list[Table]:
@@ -85,7 +95,7 @@ def _pictures(result: Calibration) -> dict[str, Any]:
         name: Markup(draw(result))
         for name, draw in (
             ("residuals", pictures.residuals),
-            ("sphere", pictures.sphere),
+            ("sphere", sphere.sphere),
             ("convergence", pictures.convergence),
             ("dilution", pictures.dilution),
         )

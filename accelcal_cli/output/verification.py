@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from accelcal_cli.calibration.verify import Verification
-from accelcal_cli.calibration.verify_tables import tables
+from accelcal_cli.calibration.verify_tables import differences, tests
 from accelcal_cli.output import console as rich_console
 
 
@@ -12,4 +12,5 @@ def show_verification(result: Verification) -> None:
     out = rich_console.console()
     rich_console.verdict(result.verdict, result.reasons, out)
     out.print()
-    rich_console.show(tables(result), out)
+    rich_console.show_split(differences(result), out)
+    rich_console.show([tests(result)], out)

@@ -16,6 +16,12 @@ from accelcal_cli.sensor.spool import IN_MEMORY, RowStore
 Floats = NDArray[np.float64]
 STUCK = 1_000_000  # equal readings in a row after which an input is not read on
 
+RAW_ROWS = 500
+"""Rows with a time each, from which on they are rather a raw log than poses."""
+
+EACH_ROW = "each row is taken for a pose at rest"
+"""How the note on what may be a raw log begins."""
+
 
 @dataclass
 class Extent:
@@ -113,6 +119,11 @@ class Collector:
             self.notes.append(f"columns beside the readings not used: more than {IN_MEMORY:,} poses")
 
     def _by_row(self) -> Extras:
+        if self.columns.time is not None and self.store.rows >= RAW_ROWS:
+            self.notes.append(
+                f"{EACH_ROW}; if these {self.store.rows:,} rows are a log with moves in it, find its poses with "
+                "accelcal detect, or calibrate with --raw"
+            )
         if not self._extras:
             return Extras()
         count, scatter, others = self._split(np.concatenate(self._extras))

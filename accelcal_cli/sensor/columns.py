@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.sensor.cells import Selection
-from accelcal_cli.sensor.colnames import Roles, recognise, tokens_of
+from accelcal_cli.sensor.colnames import Roles, recognise, time_column, tokens_of
 from accelcal_cli.sensor.tabular import Table
 
 Triple = tuple[int, int, int]
@@ -25,6 +25,7 @@ class Columns:
     scatter: Triple | None = None
     reference: Triple | None = None
     temperature: int | None = None
+    time: int | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -194,6 +195,7 @@ def _with_extras(
         free_triple(scatter),
         free_triple(roles.reference),
         free(roles.temperature),
+        None if names is None else free(time_column(names)),
     )
     used = [k for k in (sensor, chosen.label, *chosen.extras) if k is not None]
     if names is not None and used:

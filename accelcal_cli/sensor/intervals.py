@@ -17,6 +17,13 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Moments = tuple[Floats, Floats, Floats]
 
+STEADY = 0.04
+"""Halves of a pose have means that differ by less than this part of the range of the readings, about 1 g: 2.3 degrees,
+or 5 degrees turned from end to end."""
+
+BEYOND_NOISE = 5.0
+"""Sigmas that halves have to differ by before it is no longer noise, or the beat of a vibration."""
+
 
 @dataclass(frozen=True)
 class Intervals:
@@ -66,23 +73,29 @@ class Found:
         multiplier: of the level.
         intervals: the still intervals that are long enough.
         short: rows of those that are not, before trimming, shape (s,).
+        turning: rows of those that are, but turn while they last, before trimming, shape (t,).
     """
 
     multiplier: float
     intervals: Intervals
     short: Ints
+    turning: Ints
 
 
 def find_intervals(tiles: Tiles, rows: Rows, level: Level, multipliers: Sequence[float]) -> list[Found]:
     """Return the still intervals of a log for every multiplier of the level."""
     firsts, lasts = runs(tiles, rows, level, multipliers)
     ends = [_trimmed(first, last, rows) for first, last in zip(firsts, lasts, strict=True)]
-    measured = Atoms.of(tiles, np.unique(np.concatenate([tile for pair in ends for tile in pair])))
+    edges = [edge for a, b in ends for edge in (a, (a + b) // 2, b)]
+    measured = Atoms.of(tiles, np.unique(np.concatenate(edges)))
     found = []
     for k, (a, b) in enumerate(ends):
         enough = (b - a) * tiles.size >= rows.least
-        whole = (lasts[k] - firsts[k] + rows.width) * tiles.size
-        found.append(Found(multipliers[k], measured.intervals(a[enough], b[enough]), whole[~enough]))
+        turning = enough.copy()
+        turning[enough] = measured.turning(a[enough], b[enough], level.extent)
+        still, whole = enough & ~turning, (lasts[k] - firsts[k] + rows.width) * tiles.size
+        intervals = measured.intervals(a[still], b[still])
+        found.append(Found(multipliers[k], intervals, whole[~enough], whole[turning]))
     return found
 
 
@@ -142,6 +155,21 @@ class Atoms:
         scatter = np.sqrt(square / np.maximum(count - 1, 1)[:, None])
         time = None if self.time is None else np.stack([self.time[low, 0], self.time[high - 1, 1]], axis=1)
         return Intervals(a * self.tile + 1, b * self.tile, count.astype(np.int64), mean, scatter, time)
+
+    def turning(self, a: Ints, b: Ints, extent: float) -> NDArray[np.bool_]:
+        """Return which of the intervals of tiles a to b - 1, each shape (I,), turn while they last.
+
+        Args:
+            a, b: edges, with those halfway between them.
+            extent: half the range of the readings, sensor units.
+        """
+        middle, turning = (a + b) // 2, np.zeros(len(a), dtype=bool)
+        two = middle > a
+        one, other = self.intervals(a[two], middle[two]), self.intervals(middle[two], b[two])
+        apart = np.linalg.norm(other.mean - one.mean, axis=1)
+        noise = (one.scatter**2).sum(axis=1) / one.n + (other.scatter**2).sum(axis=1) / other.n
+        turning[two] = (apart > STEADY * extent) & (apart > BEYOND_NOISE * np.sqrt(noise))
+        return turning
 
 
 def _together(items: Moments, low: Ints, high: Ints) -> Moments:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.cells import Selection
@@ -29,6 +29,7 @@ class RawColumns:
     Attributes:
         output: the accelerometer; names: of its columns, or their numbers from 1.
         gyro, time: None where there are none.
+        dated: `time` holds dates, not numbers.
         guessed: `time` is only time when it never decreases.
         doubtful: what to say when a guessed time column is none and so nothing is known of the others.
         notes: what a user should know.
@@ -38,13 +39,17 @@ class RawColumns:
     names: tuple[str, str, str]
     gyro: Triple | None = None
     time: int | None = None
+    dated: bool = False
     guessed: bool = False
     doubtful: str = ""
     notes: tuple[str, ...] = ()
 
     def selection(self) -> Selection:
-        """What to ask of the table: acceleration, gyroscope, time."""
-        return Selection((*self.output, *(self.gyro or ()), *(() if self.time is None else (self.time,))))
+        """What to ask of the table: acceleration, gyroscope, time; dates as text."""
+        sensors = (*self.output, *(self.gyro or ()))
+        if self.time is None or self.dated:
+            return Selection(sensors, text=self.time)
+        return Selection((*sensors, self.time))
 
 
 def choose_raw(
@@ -71,8 +76,14 @@ def choose_raw(
     used = [*found.output, *(turning or ()), *(() if clock is None else (clock,))]
     if len(set(used)) < len(used):
         raise UsageError("--columns, --gyro, --time: a column is asked for twice")
-    doubtful = found.doubtful if time is None else ""
-    return RawColumns(found.output, found.names, turning, clock, guessed, doubtful, found.notes)
+    return replace(
+        found,
+        gyro=turning,
+        time=clock,
+        dated=clock is not None and not table.numeric[clock],
+        guessed=guessed,
+        doubtful=found.doubtful if time is None else "",
+    )
 
 
 def _named(table: Table, columns: Sequence[str] | None) -> RawColumns:
@@ -107,7 +118,7 @@ def _nameless(table: Table) -> RawColumns:
         f"{table.name}: has {width} columns and no header, and the first is not time; say which are x, y, z "
     )
     doubtful += "with --columns, as in --columns 1,2,3"
-    return RawColumns(output, names, gyro, time, time is not None, doubtful, (note,))
+    return RawColumns(output, names, gyro, time, guessed=time is not None, doubtful=doubtful, notes=(note,))
 
 
 def _stated_gyro(table: Table, gyro: Sequence[str]) -> Triple | None:

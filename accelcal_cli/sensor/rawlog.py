@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.cells import Rows
+from accelcal_cli.sensor.clock import Clock, dated, unit_of
 from accelcal_cli.sensor.rawcolumns import RawColumns, choose_raw
 from accelcal_cli.sensor.tabular import Table, open_table
 
@@ -19,12 +20,6 @@ Floats = NDArray[np.float64]
 
 PROBE = 1000
 """Rows that tell the step of the time column, and whether a column without a name is one."""
-
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Units of a time column, in seconds."""
-
-SLOWEST = 1.0
-"""Hz: no raw log is slower, so a slower one is taken as being in a smaller unit of time."""
 
 
 @dataclass(frozen=True)
@@ -46,40 +41,18 @@ class RawRows:
         return self.numbers[:, -1] if self.timed else None
 
 
-@dataclass(frozen=True)
-class Clock:
-    """What the time column says.
-
-    Attributes:
-        rate: rows a second, Hz; None where nothing says it.
-        unit: of the time column: s, ms, us or ns.
-    """
-
-    rate: float | None = None
-    unit: str = "s"
-
-    @classmethod
-    def of(cls, time: Floats) -> Self:
-        """Tell rate and unit from the first rows. A step of exactly 1 counts rows and says nothing of time."""
-        steps = np.diff(time)
-        steps = steps[steps > 0]
-        if not len(steps) or (steps == 1).all():
-            return cls()
-        step = float(np.median(steps))
-        unit = next((unit for unit, size in UNITS.items() if step * size <= 1 / SLOWEST), "ns")
-        return cls(1.0 / (step * UNITS[unit]), unit)
-
-
 class RawLog:
     """A raw log that is read once, from top to bottom."""
 
     def __init__(self, table: Table, columns: RawColumns) -> None:
         """Read the first rows of `table`: they tell what the time column is."""
         self.name = table.name
+        self.columns = columns
         self._table = table
         self._rows = table.blocks(columns.selection())
+        if columns.dated:
+            self._rows = dated(self._rows, self._time_at)
         self._head = _first(self._rows, PROBE)
-        self.columns = columns
         self.clock = Clock()
         self.notes = list(columns.notes)
         self._settle_time()
@@ -95,7 +68,9 @@ class RawLog:
                 raise DataError(columns.doubtful)
             self.columns = replace(columns, time=None)
             return
-        self.clock = Clock.of(times)
+        self.clock = Clock.of(times, self._unit())
+        if columns.dated:
+            self.notes.append("time is counted in seconds from the first row")
         if columns.guessed:
             self.notes.append(f"column {columns.time + 1} taken as time: it never decreases")
         if self.clock.rate is None:
@@ -103,6 +78,19 @@ class RawLog:
             self.notes.append(f"column {columns.time + 1} counts rows, it is no time")
         elif self.clock.unit != "s":
             self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows a second")
+
+    def _unit(self) -> str | None:
+        """Unit of the time column, where it is known before its steps are."""
+        if self.columns.dated:
+            return "s"
+        names, time = self._table.names, self.columns.time
+        return None if names is None or time is None else unit_of(names[time])
+
+    def _time_at(self, row: int) -> str:
+        """How to name the time of a row (from 0) that has been read."""
+        names, time = self._table.names, self.columns.time or 0
+        column = str(time + 1) if names is None else f'"{names[time]}"'
+        return f"{self.name}, {self.where(row)}, column {column}"
 
     @property
     def sha256(self) -> str:

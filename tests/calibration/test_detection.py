@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from raw_logs import G, opened, simulated, text
+from simulated import MEMS, noise
 
 from accelcal_cli.calibration.attitudes import attitudes
-from accelcal_cli.calibration.detection import MULTIPLIERS, TIE, DetectSettings, detect
+from accelcal_cli.calibration.candidates import TIE
+from accelcal_cli.calibration.detection import MULTIPLIERS, DetectSettings, detect
 from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.weighting import shared_variance, shared_weights
@@ -17,8 +22,6 @@ from accelcal_cli.sensor.poses import fibonacci
 from accelcal_cli.sensor.rawlog import open_raw_log
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.sensor.spans import Span, Spans
-from tests.sensor.raw_logs import G, opened, simulated, text
-from tests.simulated import MEMS, noise
 
 XSENS = ErrorModel(
     np.array([[414.441645, 0, 0], [1.477289, 412.122680, 0], [3.832964, 8.841874, 414.507889]]),
@@ -39,6 +42,9 @@ IMU_TK = DetectSettings(
     multipliers=tuple(float(k) for k in range(2, 11)),
 )
 """The settings that imu_tk uses for its recording."""
+
+ONE = DetectSettings(multipliers=(5.0,))
+"""One multiplier, for what does not depend on the choice."""
 
 RECORDINGS = [
     ("imu_tk_xsens/xsens_acc.txt", 9.81744, DetectSettings(g=9.81744), XSENS, 30, 1.2e-3),
@@ -130,8 +136,8 @@ def twice(seed=6):
 @pytest.mark.parametrize("how", ["merge", "thin"])
 def test_close_poses_become_one_on_request(how):
     names = "ax,ay,az,wx,wy,wz"
-    every = detected(twice(), names=names).intervals
-    few = detected(twice(), DetectSettings(**{how: 1.0}), names=names).intervals
+    every = detected(twice(), ONE, names=names).intervals
+    few = detected(twice(), dataclasses.replace(ONE, **{how: 1.0}), names=names).intervals
     assert len(every) == 26
     assert len(few) == 13
     if how == "merge":
@@ -154,7 +160,7 @@ def test_attitudes_go_to_the_longest_pose():
         (
             DetectSettings(spans=Spans(least=Span(30.0))),
             14,
-            "0 still poses .*14 stretches.*hold each pose longer",
+            "no still pose, 12 are needed.*14 stretches.*hold each pose longer",
         ),
         (DetectSettings(least_poses=13, multipliers=(5.0,)), 12, "12 still poses.*multiplier 5"),
     ],
@@ -170,7 +176,7 @@ def test_too_few_poses_are_explained(settings, positions, said):
 def test_one_attitude_held_often_is_not_enough():
     one, _ = simulated(2, seed=1, timed=False)
     with pytest.raises(DataError, match=r"turn the sensor to more attitudes.*--min-poses"):
-        detected(np.concatenate([one] * 8), names="ax,ay,az,wx,wy,wz")
+        detected(np.concatenate([one] * 8), ONE, names="ax,ay,az,wx,wy,wz")
 
 
 def test_a_log_that_never_rests_is_told_so():
@@ -178,6 +184,35 @@ def test_a_log_that_never_rests_is_told_so():
     moving = 9 * np.sin(t * [1.0, 1.3, 1.7]) + np.sin(40 * t)
     with pytest.raises(DataError, match="no part of the log is still"):
         detected(moving, names="ax,ay,az")
+
+
+def moving(seconds, speed, noise):
+    """Readings in m/s^2 at 100 Hz, shape (n, 3), of a sensor that turns without a rest."""
+    t = np.arange(100.0 * seconds)[:, None] / 100
+    u = np.sin(speed * t * [0.9, 1.3, 1.1] + [0.0, 1.0, 2.0])
+    return G * u / np.linalg.norm(u, axis=1, keepdims=True) + noise * np.random.default_rng(1).normal(
+        size=u.shape
+    )
+
+
+@pytest.mark.parametrize(
+    ("speed", "noise", "said"),
+    [(1.0, 0.5, "no part of the log is still"), (0.03, 0.05, r"turns while they last.*put the sensor down")],
+)
+def test_turning_is_no_pose_however_slow_or_noisy(speed, noise, said):
+    with pytest.raises(DataError, match=said):
+        detected(moving(300, speed, noise), names="ax,ay,az")
+
+
+def test_a_vibration_is_no_motion():
+    """A fan of 23 Hz and 3 m/s^2: the poses are there, and their scatter says what they are worth."""
+    numbers, holds = simulated(16, seed=3)
+    numbers[:, :3] += 1670 * 3 * np.sin(2 * np.pi * 23.3 * numbers[:, -1:] + [0.0, 1.0, 2.0])
+    found = detected(numbers)
+    assert len(found.intervals) == len(holds)
+    result = calibrate(found.readings(), Settings(g=G, weights="auto"))
+    assert result.verdict == "good"
+    assert_within(result, load_sensor("mems").model.in_gauge("lower"), 4.0)
 
 
 def test_fewer_poses_may_be_accepted():

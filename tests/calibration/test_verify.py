@@ -13,7 +13,7 @@ from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.quality import PARAMETERS, design
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verify import verify
-from accelcal_cli.calibration.verify_tables import tables
+from accelcal_cli.calibration.verify_tables import differences, tests
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
@@ -153,9 +153,20 @@ def test_the_record_is_plain_and_the_tables_hold_it():
     assert record["schema"] == "accelcal/verification/1"
     assert record["differences"][3]["value"] is None
     assert record["result"]["sha256"] != record["data"]["sha256"]
-    differences, tests = tables(found)
-    assert len(differences.rows) == 9
-    assert ("tolerance", "0.01", "m/s^2") in tests.rows
+    assert len(differences(found).rows) == 9
+    assert ("tolerance", "0.01", "m/s^2") in tests(found).rows
+
+
+def test_differences_are_those_of_the_matrix_that_the_result_shows():
+    """K_a and D_a of the later sensor minus those of the earlier, in gauge lower and in an engineer's units."""
+    later = moved(scale=(0.002, 0, 0), bias=(0, 0.05, 0))
+    later = ErrorModel(later.K + np.array([[0, 0, 0], [0, 0, 0], [0.003 * LOWER.K[2, 2], 0, 0]]), later.D)
+    clean = calibrate(readings(poses.turns(), model=MEMS, sigma=1e-6), FAST)
+    rows = differences(verify(clean, new(model=later, sigma=1e-6))).rows
+    expected = np.zeros(9)
+    expected[[0, 4, 7]] = 2000.0, 3000.0, 0.05 / G * 1e6
+    np.testing.assert_allclose([row[1] for row in rows], expected, atol=0.02 * 3000)
+    assert [row[3] for row in rows] == ["ppm"] * 3 + ["micro-rad"] * 3 + ["micro-g"] * 3
 
 
 def test_temperatures_are_brought_to_that_of_the_result():

@@ -131,7 +131,9 @@ def test_reproduce_alone_lists_the_experiments(run):
     done = run("reproduce", "--format", "json")
     rows = json.loads(done.out)
     assert done.code == 0
-    assert {"dpso-table2", "ifoa-calibration", "akpso-calibration", "depf-rmse"} <= {row["name"] for row in rows}
+    assert {"dpso-table2", "ifoa-calibration", "akpso-calibration", "depf-rmse"} <= {
+        row["name"] for row in rows
+    }
     assert set(rows[0]) == {"name", "title", "source"}
     listed = run("reproduce").out
     assert all(row["name"] in listed for row in rows)

@@ -65,6 +65,18 @@ def test_raw_is_detect_and_calibrate_in_one(run, log):
     assert np.abs(away[lower] / np.array(one["sigma"]["K_a"])[lower]).max() < 4
 
 
+def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
+    said = "each row is taken for a pose at rest; if these"
+    plain = run("calibrate", log, "--optimizer", "ellipsoid", "-o", "wrong.yaml")
+    assert said in plain.out.replace("\n", " ")
+    assert said not in run("calibrate", log, "--raw", "--optimizer", "ellipsoid").out.replace("\n", " ")
+    assert run("verify", "wrong.yaml", log).err.startswith(f"accelcal: raw.csv: {said}")
+    assert run("plan", log).err.startswith(f"accelcal: raw.csv: {said}")
+    assert run("detect", log, "-o", "poses.csv").code == 0
+    assert said not in run("calibrate", "poses.csv", "--optimizer", "ellipsoid").out.replace("\n", " ")
+    assert run("plan", "poses.csv").err == ""
+
+
 def test_weights_of_a_raw_log_can_be_stated(run, log):
     Path("plain.yaml").write_text("weights: none\n")
     for arguments in (["--weights", "none"], ["--config", "plain.yaml"]):
@@ -120,6 +132,17 @@ def test_a_picture_of_the_log(run, log, suffix):
     assert Path(f"log.{suffix}").read_bytes() == first
     if suffix == "svg":
         assert b"static pose" in first
+
+
+def test_a_picture_shows_why_detection_failed(run, log):
+    pytest.importorskip("matplotlib")
+    failed = run("detect", log, "--min-poses", "15", "--plot", "log.svg", "-o", "out.csv")
+    assert failed.code == 2
+    assert failed.err.startswith("accelcal: wrote log.svg\naccelcal: raw.csv: 14 still poses")
+    assert "14 static poses" in Path("log.svg").read_text()
+    assert not Path("out.csv").exists()
+    assert run("detect", log, "--min-length", "60", "--plot", "none.svg", "-q").err.count("\n") == 1
+    assert "0 static poses" in Path("none.svg").read_text()
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_the_level_decides(run, result, other):
 def test_differences_as_csv(run, result, other):
     rows = list(csv.DictReader(io.StringIO(run("verify", result, other, "--format", "csv").out)))
     assert [row["parameter"] for row in rows][6] == "bias x"
-    assert {row["unit"] for row in rows} == {"ppm", "mrad", "micro-g"}
+    assert {row["unit"] for row in rows} == {"ppm", "micro-rad", "micro-g"}
 
 
 def test_readings_from_a_pipe_and_a_json_result(run, good, other):

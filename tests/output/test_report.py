@@ -17,7 +17,7 @@ from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.output import pictures
-from accelcal_cli.output.report import page
+from accelcal_cli.output.report import page, typeset
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.readings import Readings
 
@@ -107,7 +107,7 @@ def test_the_verdict_comes_first(kind):
     text = re.sub(r"\s+", " ", Reader(_page(kind)).text)
     assert text.index(f"Verdict: {result.verdict}") < text.index("Parameters")
     for sentence in (*result.reasons, *result.notes, result.before):
-        assert sentence in text
+        assert typeset(sentence) in text
 
 
 def test_a_page_holds_every_part(good):
@@ -148,6 +148,24 @@ def test_an_outlier_is_marked_in_both_pictures_of_poses():
     for name in ("residuals", "sphere"):
         assert "var(--bad)" in _drawings("outlier")[name]
         assert "var(--bad)" not in _drawings("good")[name]
+
+
+def test_the_verdict_says_how_well_the_parameters_are_known(good):
+    sigma = np.sqrt(np.diagonal(good.covariance)) / good.g * np.repeat([1e6, 1e3, 1e6], 3)
+    said = re.search(
+        r"scale ([\d.,]+) ppm, misalignment ([\d.,]+) mrad, bias ([\d.,]+) micro-g", _page("good")
+    )
+    largest = [float(value.replace(",", "")) for value in said.groups()]
+    np.testing.assert_allclose(largest, sigma.reshape(3, 3).max(axis=1), rtol=0.05)
+    assert "one-sigma" not in _page("undetermined")
+
+
+def test_units_have_raised_powers():
+    assert (
+        typeset("rms [m/s^2], L [(m/s^2)^4], [(g)^4]") == "rms [m/s\u00b2], L [(m/s\u00b2)\u2074], [g\u2074]"
+    )
+    for kind in KINDS:
+        assert "^" not in Reader(_page(kind)).text
 
 
 def test_every_table_has_a_caption_and_headings():
@@ -200,7 +218,7 @@ def test_text_of_the_result_is_not_taken_for_html(good):
 def browser():
     path = chromium.browser()
     if path is None:
-        pytest.skip("no chromium and chromedriver here")
+        pytest.skip("no chromium and chromedriver here: apt-get install chromium chromium-driver")
     with chromium.session(path) as found:
         yield found
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raw_logs import opened, simulated, text
 
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor.rawlog import Clock
-from tests.sensor.raw_logs import opened, simulated, text
+from accelcal_cli.sensor.clock import Clock, unit_of
 
 LOG, _ = simulated(2, hold=4.0)
 A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]
@@ -95,6 +95,92 @@ def test_the_unit_of_time_is_told_by_its_step(step, rate, unit):
     clock = Clock.of(1e4 + step * np.arange(50.0))
     assert clock.rate == pytest.approx(rate, rel=1e-6)
     assert clock.unit == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("t", None),
+        ("timestamp", None),
+        ("time", None),
+        ("axis", None),
+        ("timestamp_ms", "ms"),
+        ("time [us]", "us"),
+        ("Time (s)", "s"),
+        ("seconds", "s"),
+        ("t_ns", "ns"),
+        ("millis", "ms"),
+    ],
+)
+def test_the_name_of_a_time_column_may_tell_its_unit(name, unit):
+    assert unit_of(name) == unit
+
+
+def test_a_millisecond_a_row_is_no_row_number():
+    rows = np.hstack([np.arange(len(A))[:, None], A])
+    assert opened(text(rows, names="t_ms,ax,ay,az")).clock == Clock(1000.0, "ms")
+    assert opened(text(rows, names="t,ax,ay,az")).clock == Clock()
+    assert Clock.of(10.0 * np.arange(9), "s").unit == "ms"  # no log has a row in ten seconds
+
+
+def with_dates(form, sep=","):
+    """The log with its time written as dates that begin shortly before midnight."""
+    start = np.datetime64("2026-02-28T23:59:58.500")
+    stamps = start + np.round(T[:, 0] * 1e6).astype("timedelta64[us]")
+    lines = [sep.join([form(str(s)), *(repr(float(v)) for v in a)]) for s, a in zip(stamps, A, strict=True)]
+    return "\n".join([sep.join(["time", "ax", "ay", "az"]), *lines, ""]).encode()
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        str,
+        lambda stamp: stamp.replace("T", " "),
+        lambda stamp: stamp + "Z",
+        lambda stamp: stamp[:-3] + "-05:00",
+        lambda stamp: f'"{stamp}+0100"',
+    ],
+)
+def test_dates_are_seconds_from_the_first_row(form):
+    log = opened(with_dates(form))
+    assert log.clock.rate == pytest.approx(100.0)
+    assert any("seconds from the first row" in note for note in log.notes)
+    np.testing.assert_allclose(read(log), np.hstack([A, T - T[0]]), atol=1e-9)
+
+
+def test_dates_with_a_decimal_comma():
+    log = opened(with_dates(lambda stamp: stamp.replace(".", ","), sep=";"))
+    np.testing.assert_allclose(read(log)[:, 3:], T - T[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("late", [3, 900])
+@pytest.mark.parametrize("wrong", ["now", "2026-02-30T00:00:00", "12:30:01.5", "2026-02-28T23:59:59+01:00"])
+def test_a_date_that_is_none_is_named(wrong, late):
+    lines = with_dates(str).split(b"\n")
+    lines[late] = wrong.encode() + lines[late][lines[late].index(b",") :]
+    with pytest.raises(DataError, match=f'line {late + 1}, column "time": ".*" is no time; .*--time none'):
+        read(opened(b"\n".join(lines)))
+
+
+def test_dates_that_go_back_are_named():
+    lines = with_dates(str).split(b"\n")
+    lines[500], lines[501] = lines[501], lines[500]
+    with pytest.raises(DataError, match=r"line 502: time 4.99 comes after 5; expected"):
+        read(opened(b"\n".join(lines)))
+
+
+def test_dates_in_parquet(tmp_path):
+    import polars
+
+    from accelcal_cli.sensor.rawlog import open_raw_log
+
+    start = np.datetime64("2026-02-28T23:59:58.500000", "us")
+    frame = polars.DataFrame(A, schema=["ax", "ay", "az"]).with_columns(
+        polars.Series("time", start + np.round(T[:, 0] * 1e6).astype("timedelta64[us]"))
+    )
+    frame.write_parquet(tmp_path / "log.parquet")
+    log = open_raw_log(tmp_path / "log.parquet")
+    np.testing.assert_allclose(read(log), np.hstack([A, T - T[0]]), atol=1e-9)
 
 
 def test_row_numbers_are_no_time():

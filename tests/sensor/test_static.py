@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from raw_logs import in_blocks, simulated
 
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.envelope import MOST, Envelope
@@ -15,7 +16,6 @@ from accelcal_cli.sensor.intervals import Intervals, find_intervals, merge
 from accelcal_cli.sensor.spans import Rows, Span, Spans, parse_span
 from accelcal_cli.sensor.static import find_level, windows
 from accelcal_cli.sensor.tiles import Tiles
-from tests.sensor.raw_logs import in_blocks, simulated
 
 ROWS = Rows(tile=10, width=10, still=None, least=100, trim=50)
 
@@ -134,6 +134,31 @@ def test_a_gyroscope_sees_what_noise_hides():
 
     assert covers(without.intervals)
     assert not covers(with_gyro.intervals)
+
+
+@pytest.mark.parametrize(("degrees", "still"), [(2.0, True), (10.0, False)])
+def test_a_pose_that_turns_while_it_lasts_is_none(degrees, still):
+    """So slowly that no window sees it, and without a gyroscope."""
+    numbers, holds = simulated(noise=0.05, seed=5, gyro=False, timed=False, hold=8.0)
+    start, end = holds[6]
+    mean = numbers[start - 1 : end, :3].mean(axis=0)
+    aside = np.linalg.norm(mean) * np.cross(mean, [1, 0, 0]) / np.linalg.norm(np.cross(mean, [1, 0, 0]))
+    numbers[start - 1 : end, :3] += (
+        np.radians(degrees) * np.linspace(-0.5, 0.5, end - start + 1)[:, None] * aside
+    )
+    (seen,) = found(tiled(numbers, gyro=False, timed=False), multipliers=(20.0,))
+    assert len(seen.intervals) == len(holds) - (not still)
+    assert ((seen.intervals.start >= start) & (seen.intervals.end <= end)).any() == still
+    assert len(seen.turning) == (not still)
+    assert seen.turning.sum() == pytest.approx(0 if still else end - start, abs=ROWS.window)
+
+
+def test_noise_is_no_turning():
+    """Halves of short poses differ by more than the limit when the sensor is noisy enough."""
+    numbers, holds = simulated(noise=4.0, seed=2)
+    (seen,) = found(tiled(numbers))
+    assert len(seen.turning) == 0
+    assert len(seen.intervals) == len(holds)
 
 
 def test_a_constant_turning_rate_is_a_bias():
