@@ -11,7 +11,7 @@ from accelcal_cli.calibration.residuals import modulus_errors, square_error
 from accelcal_cli.calibration.search import model_at
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verdict import at_edge
-from accelcal_cli.calibration.weighting import fitted, shared_weights
+from accelcal_cli.calibration.weighting import fitted, opened, shared_weights
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
 
@@ -21,7 +21,7 @@ class Screened:
     """What a set of poses is worth.
 
     Attributes:
-        model: the sensor they fit; rms: of |f| - g, m/s^2.
+        model: the sensor they fit; rms: of |f| - g, m/s^2, NaN where the poses fix no ellipsoid.
         s: standard deviation of one pose's modulus, m/s^2; NaN for nine poses or fewer.
         dop: the worst dilution of precision; verdict: good, weak or undetermined.
     """
@@ -36,6 +36,9 @@ class Screened:
 def screen(readings: Readings, g: float) -> Screened:
     """Calibrate readings that carry count and scatter, weighted by both and by what the poses share."""
     settings = Settings(g=g)
+    rough = _rough(readings, settings)
+    if rough is not None:
+        return rough
     problem, x = fitted(readings, settings, shared_weights(readings, settings))
     model = model_at(problem, x)
     seen = Observability.of(information(problem, x)[0], readings.poses)
@@ -50,3 +53,13 @@ def screen(readings: Readings, g: float) -> Screened:
         seen.worst,
         "undetermined" if at_edge(x).any() else seen.verdict,
     )
+
+
+def _rough(readings: Readings, settings: Settings) -> Screened | None:
+    """Return the nearest sphere where the poses determine no more, so that no search has to find that out."""
+    problem, source = opened(readings, settings, None)
+    middle = np.zeros_like(problem.box.centre)
+    seen = Observability.of(information(problem, middle)[0], readings.poses)
+    if source != "sphere" or seen.verdict != "undetermined":
+        return None
+    return Screened(model_at(problem, middle), np.nan, np.nan, np.inf, seen.verdict)

@@ -87,12 +87,18 @@ def shared_variance(errors: Float, own: Float, freedom: int) -> float:
     return high
 
 
-def fitted(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Float]:
-    """Return the problem of the weighted readings and the point, shape (1, D), polished from the middle of its box."""
+def opened(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, str]:
+    """Return the problem of the weighted readings, and where the middle of its box comes from, see `Start`."""
     centre = 0.5 * (readings.lower + readings.upper)
     scale = 0.5 * float((readings.upper - readings.lower).max())
     triangle = compress(weighted(readings, weights), centre, scale)
-    problem = Loetters(triangle, settings.g, search_box(triangle, settings).box)
+    start = search_box(triangle, settings)
+    return Loetters(triangle, settings.g, start.box), start.source
+
+
+def fitted(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Float]:
+    """Return the problem of the weighted readings and the point, shape (1, D), polished from the middle of its box."""
+    problem, _ = opened(readings, settings, weights)
     return problem, polish(problem, np.zeros_like(problem.box.centre)).x
 
 
