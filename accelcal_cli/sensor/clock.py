@@ -73,7 +73,7 @@ def dated(rows: Iterable[Rows], place: Callable[[int], str]) -> Iterator[Rows]:
     """
     first, zone = np.zeros(0, dtype="datetime64[ns]"), ""
     for block in rows:
-        text = [cell.replace(",", ".") for cell in block.text or ()]
+        text = [cell.replace(",", ".") for cell in block.texts[0]]
         if not len(first) and text:
             match = _ZONE.search(text[0][len("2026-03-01") :])
             zone = "" if match is None else match[0]

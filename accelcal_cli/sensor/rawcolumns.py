@@ -47,9 +47,9 @@ class RawColumns:
     def selection(self) -> Selection:
         """What to ask of the table: acceleration, gyroscope, time; dates as text."""
         sensors = (*self.output, *(self.gyro or ()))
-        if self.time is None or self.dated:
-            return Selection(sensors, text=self.time)
-        return Selection((*sensors, self.time))
+        if self.time is None:
+            return Selection(sensors)
+        return Selection(sensors, texts=(self.time,)) if self.dated else Selection((*sensors, self.time))
 
 
 def choose_raw(
