@@ -18,7 +18,7 @@ help:
 	@echo "make test     run the tests"
 	@echo "make lint     ruff"
 	@echo "make types    mypy"
-	@echo "make bench    run the benchmarks"
+	@echo "make bench    run the benchmarks; ARGS=optimizers only those of the optimizers"
 	@echo "make docs     write the tables and outputs in the documentation anew"
 	@echo "make pictures draw the pictures of the optimizers anew"
 	@echo "make clean    remove what make made"

@@ -45,13 +45,6 @@ def mutates(u: Float, share: float, gene: Int) -> Float:
     return taken
 
 
-def apart(x: Float, picks: Int) -> tuple[Float, ...]:
-    """Return the points of x, shape (R, P, D), at every row of picks, shape (R, C, Q): C arrays (R, Q, D)."""
-    runs, rows, size = picks.shape
-    points = gather(x, picks.reshape(runs, rows * size))
-    return tuple(points[:, size * row : size * (row + 1)] for row in range(rows))
-
-
 @dataclass(frozen=True)
 class Generation(State):
     """A population; x and fx are the individuals and their costs."""
@@ -103,11 +96,11 @@ class DifferentialEvolution(Optimizer):
 
     def _change(self, x: Float, fx: Float, picks: Int) -> Float:
         """Return what mutation adds to x, [dpso2014] eq. 3 and 4: (base - x) + F (x_n - x_m)."""
-        change, other, base = apart(x, picks)
-        change -= other
+        change = gather(x, picks[:, 0])
+        change -= gather(x, picks[:, 1])
         change *= self.weight
         if self.strategy == "rand/1":
-            change += base
+            change += gather(x, picks[:, 2])
             change -= x
         elif self.strategy == "best/1":
             change += best_of(x, fx)[:, None]

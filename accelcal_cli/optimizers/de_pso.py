@@ -21,11 +21,12 @@ from accelcal_cli.optimizers.base import (
     better_of,
     drawn,
     each,
+    gather,
     integers,
     partners,
     press,
 )
-from accelcal_cli.optimizers.de import apart, mutates
+from accelcal_cli.optimizers.de import mutates
 from accelcal_cli.optimizers.pso import pairs, velocity
 from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
@@ -130,8 +131,8 @@ class HybridSwarm(Optimizer):
         The paper's beta x + (1 - beta) leader is x + (1 - beta) (leader - x).
         """
         own = self.own_max - (self.own_max - self.own_min) * curve  # [dpso2014] eq. 9
-        change, other = apart(x, picks)
-        change -= other
+        change = gather(x, picks[:, 0])
+        change -= gather(x, picks[:, 1])
         change *= self.weight
         pull = leader[:, None] - x
         pull *= 1.0 - own

@@ -187,7 +187,9 @@ def test_a_cluster_that_does_not_answer(monkeypatch):
         pass
 
 
-@pytest.mark.parametrize("address", ["", "nowhere", "tcp://host:", "http://host:8786", "host:0", "host:65536"])
+@pytest.mark.parametrize(
+    "address", ["", "nowhere", "tcp://host:", "http://host:8786", "host:0", "host:65536"]
+)
 def test_a_cluster_address_that_is_none(address):
     pytest.importorskip("distributed")
     with pytest.raises(DataError, match="expected tcp://host:port"), pools.cluster(address):
