@@ -32,6 +32,8 @@ class Streams:
 
     def __init__(self, seed: int, runs: Iterable[int], purpose: int = 0) -> None:
         """Seed one generator for every run from (seed, purpose, run), when the first number is drawn."""
+        if seed < 0:
+            raise ValueError(f"seed: {seed} is negative; expected 0 or more")
         self._seed, self._purpose, self._runs = seed, purpose, tuple(runs)
         self._started: list[Generator] | None = None
 

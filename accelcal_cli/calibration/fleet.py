@@ -7,24 +7,24 @@ cost itself (calibration.ellipsoid), and the solver confirms it with a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from accelcal_cli.calibration import quality
-from accelcal_cli.calibration.assemble import assemble, taken_for
+from accelcal_cli.calibration.assemble import assemble
 from accelcal_cli.calibration.compress import compress_each
 from accelcal_cli.calibration.ellipsoid import least_squares
+from accelcal_cli.calibration.fleet_fit import pose_weights, reasons, residuals
 from accelcal_cli.calibration.lotters import Loetters
 from accelcal_cli.calibration.nominal import Start, search_box
 from accelcal_cli.calibration.quality import Observabilities
-from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.search import Solution, polish
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.verdict import at_edge, edge_names, final_verdict, reasons_of
-from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.calibration.verdict import at_edge, final_verdict
+from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimizers.minimize import Run, minimize
 from accelcal_cli.sensor.fleet import Batch, FleetReadings
 from accelcal_cli.sensor.model import to_gauge
@@ -32,9 +32,6 @@ from accelcal_cli.streams import Bool, Float, Int
 
 FAILED = "failed"
 """Verdict on a sensor whose readings say nothing: a single pose, or all of them equal."""
-
-NAMED = 3
-"""Outlying poses of a sensor that are named one by one."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +158,7 @@ def _calibrated(
 ) -> Fleet:
     """Return the part of a batch whose readings differ."""
     g = settings.g
-    weights = _weights(readings, batch, settings)
+    weights = pose_weights(readings, batch, settings)
     triangle = compress_each(batch.output, weights, batch.count)
     start = search_box(triangle, settings)
     problem = Loetters(triangle, g, start.box)
@@ -178,7 +175,7 @@ def _calibrated(
         final_verdict(word, bool(at_edge(x).any()), int(left))
         for word, x, left in zip(seen.verdicts, run.x, freedom, strict=True)
     ]
-    rms, rms_before, outlying = _residuals(readings, batch, lower, D, start, seen, weights, settings)
+    rms, rms_before, outlying = residuals(readings, batch, lower, D, start, seen, weights, settings)
     part = Fleet(
         batch.sensors,
         batch.count,
@@ -192,7 +189,7 @@ def _calibrated(
         rms,
         rms_before,
         np.array(verdict, dtype=object),
-        _reasons(problem, start, run, seen, batch, verdict),
+        reasons(problem, start, run, seen, batch, verdict),
         outlying,
     )
     if keep is not None:
@@ -215,7 +212,7 @@ def _solve(problem: Loetters, start: Start, settings: Settings) -> Run:
     searched = np.flatnonzero(~(inside & closed))
     if len(searched):
         x[searched] = minimize(
-            _of(problem, searched),
+            problem.of(searched),
             settings.build_optimizer(),
             runs=[0] * len(searched),  # each of them would be run 0 of a calibration of its own
             seed=settings.seed,
@@ -230,11 +227,6 @@ def _least_cost(problem: Loetters) -> tuple[Float, Float]:
     return K * triangle.scale[:, None, None] / problem.g, d * triangle.scale[:, None] + triangle.centre
 
 
-def _of(problem: Loetters, index: Int) -> Loetters:
-    """Return the problem of the sensors at `index`, of a single sensor too."""
-    return Loetters(problem.triangle.take(index), problem.g, problem.box.take(index))
-
-
 def _solution(problem: Loetters, run: Run, at: int) -> Solution:
     """Return what was found for one sensor as the solution of its own calibration."""
     index = np.array([at])
@@ -247,80 +239,4 @@ def _solution(problem: Loetters, run: Run, at: int) -> Solution:
         (run.status[at],),
     )
     cost, spent = float(run.cost[at]), int(run.evaluations[at])
-    return Solution(_of(problem, index), own.x, own, 0, cost, spent, 1)
-
-
-def _weights(readings: FleetReadings, batch: Batch, settings: Settings) -> Float | None:
-    """Return the weights of the poses, mean 1 for each sensor, 0 for repetitions, shape (R, J); None for all alike."""
-    real = batch.real
-    if settings.weights == "none":
-        return None if real.all() else real.astype(float)
-    weights = np.ones(real.shape) if batch.behind is None else batch.behind
-    if settings.weights == "sd":
-        square = None if batch.scatter is None else np.mean(batch.scatter**2, axis=2)
-        weights = np.full(real.shape, np.nan) if square is None else weights / square
-    bad = (batch.behind is None) | ~(np.isfinite(weights) & (weights > 0)) & real
-    if np.any(bad):
-        at = int(np.argmax(np.broadcast_to(bad, real.shape).any(axis=1)))
-        what = {"n": "counts", "sd": "counts and standard deviations above zero"}[settings.weights]
-        raise DataError(
-            f'{readings.source}: sensor "{readings.sensors[batch.sensors[at]]}": --weights {settings.weights} needs '
-            f"{what} (columns n, sx, sy, sz), or at least two readings of every pose"
-        )
-    weights = np.where(real, weights, 0.0)
-    mean: Float = weights.sum(axis=1, keepdims=True) / batch.count[:, None]
-    return weights / mean
-
-
-def _residuals(
-    readings: FleetReadings,
-    batch: Batch,
-    K: Float,
-    D: Float,
-    start: Start,
-    seen: Observabilities,
-    weights: Float | None,
-    settings: Settings,
-) -> tuple[Float, Float, np.ndarray]:
-    """Return rms of |f| - g after and before, m/s^2, shape (R,), and each sensor's outlying poses in words."""
-    g, real, poses = settings.g, batch.real, batch.count
-    force = (batch.output - D[:, None]) @ np.linalg.inv(K).swapaxes(1, 2)
-    size = np.linalg.norm(force, axis=2)
-    centre = start.box.centre
-    scale, bias, _ = taken_for(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
-    before = np.linalg.norm((batch.output - bias[:, None]) / scale[:, None], axis=2)
-    rms, rms_before = (np.sqrt(np.sum(real * (f - g) ** 2, axis=1) / poses) for f in (size, before))
-    w = np.ones(real.shape) if weights is None else weights
-    scaled = np.sqrt(w) * (g * g - size**2) / (2.0 * g)
-    unit = force / np.where(size > 0, size, 1.0)[..., None]
-    room = room_of(leverages(quality.design(unit), w, seen.cofactor))
-    freedom = poses[:, None] - 9
-    total = np.sum(scaled**2, axis=1, keepdims=True)
-    far = np.where(real, np.abs(studentise(scaled, room, total, freedom)), np.nan)
-    outlying = beyond_chance(far, *(np.broadcast_to(a, far.shape) for a in (poses[:, None], freedom)))
-    words = np.full(len(poses), "", dtype=object)
-    for at in np.flatnonzero(outlying.any(axis=1)):
-        found = batch.pose[at, np.flatnonzero(outlying[at])]
-        more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
-        words[at] = ", ".join(readings.where(int(pose)) for pose in found[:NAMED]) + more
-    return rms, rms_before, words
-
-
-def _reasons(
-    problem: Loetters, start: Start, run: Run, seen: Observabilities, batch: Batch, verdict: Sequence[str]
-) -> np.ndarray:
-    """Return why each verdict is not good, shape (R,); readings that fix no ellipsoid are seen from the sphere."""
-    words = np.full(len(verdict), "", dtype=object)
-    index = np.flatnonzero([word != "good" for word in verdict])
-    if not len(index):
-        return words
-    middle = np.zeros((len(index), problem.unknowns))
-    sphere = Observabilities.of(quality.information(_of(problem, index), middle), batch.count[index])
-    for k, at in enumerate(index):
-        first = sphere.one(k)
-        round_ = start.sources[at] == "sphere" and first.verdict == "undetermined"
-        lines = reasons_of(
-            first if round_ else seen.one(int(at)), (), edge_names(run.x[at]), int(batch.count[at]) - 9
-        )
-        words[at] = " ".join(lines)
-    return words
+    return Solution(problem.of(index), own.x, own, 0, cost, spent, 1)

@@ -166,6 +166,10 @@ class Loetters(Problem):
         """Return the problem of the sensors at `index`; itself when all runs share one sensor."""
         if len(self.triangle.scale) == 1:
             return self
+        return self.of(index)
+
+    def of(self, index: Int) -> Loetters:
+        """Return the problem of the sensors at `index`, which are sensors of their own even where there is one."""
         return Loetters(self.triangle.take(index), self.g, self.box.take(index))
 
     def parameters(self, x: Float) -> tuple[Float, Float]:

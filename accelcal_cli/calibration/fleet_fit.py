@@ -1,0 +1,99 @@
+"""Weights, residuals and reasons of a batch of sensors, pose by pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.assemble import taken_for
+from accelcal_cli.calibration.lotters import Loetters
+from accelcal_cli.calibration.nominal import Start
+from accelcal_cli.calibration.quality import Observabilities
+from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.verdict import edge_names, reasons_of
+from accelcal_cli.errors import DataError
+from accelcal_cli.optimizers.minimize import Run
+from accelcal_cli.sensor.fleet import Batch, FleetReadings
+from accelcal_cli.streams import Float
+
+NAMED = 3
+"""Outlying poses of a sensor that are named one by one."""
+
+
+def pose_weights(readings: FleetReadings, batch: Batch, settings: Settings) -> Float | None:
+    """Return the weights of the poses, mean 1 for each sensor, 0 for repetitions, shape (R, J); None for all alike."""
+    real = batch.real
+    if settings.weights == "none":
+        return None if real.all() else real.astype(float)
+    weights = np.ones(real.shape) if batch.behind is None else batch.behind
+    if settings.weights == "sd":
+        square = None if batch.scatter is None else np.mean(batch.scatter**2, axis=2)
+        weights = np.full(real.shape, np.nan) if square is None else weights / square
+    bad = (batch.behind is None) | ~(np.isfinite(weights) & (weights > 0)) & real
+    if np.any(bad):
+        at = int(np.argmax(np.broadcast_to(bad, real.shape).any(axis=1)))
+        what = {"n": "counts", "sd": "counts and standard deviations above zero"}[settings.weights]
+        raise DataError(
+            f'{readings.source}: sensor "{readings.sensors[batch.sensors[at]]}": --weights {settings.weights} needs '
+            f"{what} (columns n, sx, sy, sz), or at least two readings of every pose"
+        )
+    weights = np.where(real, weights, 0.0)
+    mean: Float = weights.sum(axis=1, keepdims=True) / batch.count[:, None]
+    return weights / mean
+
+
+def residuals(
+    readings: FleetReadings,
+    batch: Batch,
+    K: Float,
+    D: Float,
+    start: Start,
+    seen: Observabilities,
+    weights: Float | None,
+    settings: Settings,
+) -> tuple[Float, Float, np.ndarray]:
+    """Return rms of |f| - g after and before, m/s^2, shape (R,), and each sensor's outlying poses in words."""
+    g, real, poses = settings.g, batch.real, batch.count
+    force = (batch.output - D[:, None]) @ np.linalg.inv(K).swapaxes(1, 2)
+    size = np.linalg.norm(force, axis=2)
+    centre = start.box.centre
+    scale, bias, _ = taken_for(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
+    before = np.linalg.norm((batch.output - bias[:, None]) / scale[:, None], axis=2)
+    rms, rms_before = (np.sqrt(np.sum(real * (f - g) ** 2, axis=1) / poses) for f in (size, before))
+    w = np.ones(real.shape) if weights is None else weights
+    scaled = np.sqrt(w) * (g * g - size**2) / (2.0 * g)
+    unit = force / np.where(size > 0, size, 1.0)[..., None]
+    room = room_of(leverages(quality.design(unit), w, seen.cofactor))
+    freedom = poses[:, None] - 9
+    total = np.sum(scaled**2, axis=1, keepdims=True)
+    far = np.where(real, np.abs(studentise(scaled, room, total, freedom)), np.nan)
+    outlying = beyond_chance(far, *(np.broadcast_to(a, far.shape) for a in (poses[:, None], freedom)))
+    words = np.full(len(poses), "", dtype=object)
+    for at in np.flatnonzero(outlying.any(axis=1)):
+        found = batch.pose[at, np.flatnonzero(outlying[at])]
+        more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+        words[at] = ", ".join(readings.where(int(pose)) for pose in found[:NAMED]) + more
+    return rms, rms_before, words
+
+
+def reasons(
+    problem: Loetters, start: Start, run: Run, seen: Observabilities, batch: Batch, verdict: Sequence[str]
+) -> np.ndarray:
+    """Return why each verdict is not good, shape (R,); readings that fix no ellipsoid are seen from the sphere."""
+    words = np.full(len(verdict), "", dtype=object)
+    index = np.flatnonzero([word != "good" for word in verdict])
+    if not len(index):
+        return words
+    middle = np.zeros((len(index), problem.unknowns))
+    sphere = Observabilities.of(quality.information(problem.of(index), middle), batch.count[index])
+    for k, at in enumerate(index):
+        first = sphere.one(k)
+        round_ = start.sources[at] == "sphere" and first.verdict == "undetermined"
+        lines = reasons_of(
+            first if round_ else seen.one(int(at)), (), edge_names(run.x[at]), int(batch.count[at]) - 9
+        )
+        words[at] = " ".join(lines)
+    return words
