@@ -58,7 +58,9 @@ def assemble(
     before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
     fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
     variance = _variance(readings, settings, solution, low, weights, freedom)
-    covariance = np.where(np.isfinite(seen.dop[:, None] * seen.dop), variance * seen.cofactor, np.nan)
+    # What stops at a wall of its box is not the least-squares answer.
+    firm = quality.firm(seen.dop[None], [seen.verdict], np.sqrt([variance]), g)[0] & (not edge)
+    covariance = np.where(firm[:, None] & firm, variance * seen.cofactor, np.nan)
     sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
     said, seen_first, sight = _first_sight(solution, start, information, seen, low, readings.poses)
     suggestions = _suggest(said, seen_first, readings.poses)

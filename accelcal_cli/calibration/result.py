@@ -8,9 +8,10 @@ from dataclasses import dataclass, fields
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from accelcal_cli.calibration import record as records
-from accelcal_cli.calibration.quality import Verdict
+from accelcal_cli.calibration.quality import UNDETERMINED, Verdict
 from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.sensor.model import GAUGES, ErrorModel
@@ -80,7 +81,7 @@ class Calibration:
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
-        covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9).
+        covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9); NaN where they have no sigma.
         information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
@@ -143,6 +144,17 @@ class Calibration:
     def unit(self) -> str:
         """Unit of the specific force: g when the readings were calibrated against g = 1."""
         return "g" if self.g == 1.0 else "m/s^2"
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Which of the nine parameters are not determined, shape (9,).
+
+        Definition: in an undetermined result, dilution of precision above 25, or no sigma.
+        """
+        if self.verdict != "undetermined":
+            return np.zeros(9, dtype=bool)
+        poor: NDArray[np.bool_] = np.array(list(self.dop.parameters.values())) > UNDETERMINED
+        return poor | np.isnan(np.diagonal(self.covariance))
 
     def check_determined(self, name: str, *, force: bool = False) -> None:
         """Refuse to be used where the poses left parameters undetermined, unless forced.
