@@ -10,10 +10,11 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.nominal import Start
+from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.planner import fixture_directions, next_poses
 from accelcal_cli.calibration.quality import Observability
 from accelcal_cli.calibration.residuals import Fit, examine, outliers
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import loss_weight, robust_variance
 from accelcal_cli.calibration.search import NO_NOISE, Solution, lower_problem, model_at
 from accelcal_cli.calibration.settings import Settings

@@ -11,9 +11,10 @@ from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.assemble import nominal_before
 from accelcal_cli.calibration.known import Linear, fit
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS
+from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.quality import PARAMETERS, UNDETERMINED, WEAK
 from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import pose_weights
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
