@@ -168,7 +168,7 @@ def _calibrated(
     seen = Observabilities.of(information, batch.count)
     freedom = batch.count - 9
     variance = np.where(freedom > 0, run.cost / (4.0 * g**2) / np.maximum(freedom, 1), np.nan)
-    walled = at_edge(run.x).any(axis=1)
+    walled = np.any(at_edge(run.x), axis=1)
     # What stops at a wall of its box is not the least-squares answer.
     firm = quality.firm(seen.dop, seen.verdicts, np.sqrt(variance), g) & ~walled[:, None]
     covariance = np.where(firm[:, :, None] & firm[:, None], variance[:, None, None] * seen.cofactor, np.nan)

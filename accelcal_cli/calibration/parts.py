@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from accelcal_cli.calibration.quality import BIAS, MISALIGNMENT, PARAMETERS, SCALE
 from accelcal_cli.streams import Float
 
 
@@ -35,6 +36,14 @@ class Dop:
     bias: float
     worst: float
     parameters: dict[str, float]
+
+    @classmethod
+    def of(cls, dop: Float) -> Dop:
+        """Return the record of the dilution of precision of the nine parameters, shape (9,)."""
+        misalignment, scale, bias = (float(dop[kind].max()) for kind in (MISALIGNMENT, SCALE, BIAS))
+        return cls(
+            misalignment, scale, bias, float(dop.max()), dict(zip(PARAMETERS, dop.tolist(), strict=True))
+        )
 
 
 @dataclass(frozen=True)
