@@ -41,7 +41,10 @@ def parameters(result: Calibration) -> Table:
         rows.append(row)
     columns = [Column("axis")]
     for name in ("K_x", "K_y", "K_z", "bias"):
-        columns += [Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}")]
+        columns += [
+            Column(name, format=".8g"),
+            Column("sigma", format=".2g", key=f"sigma_{name}", beside=True),
+        ]
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
@@ -95,12 +98,12 @@ def engineering(result: Calibration) -> Table:
         rows.append((f"{kind} {name.split()[-1]}", *first, unit, *again, second))
     columns = (
         Column("parameter"),
-        Column("value", format=",.1f"),
-        Column("sigma", format=",.1f"),
-        Column("unit"),
-        Column("value", format=".5f", key="value_2"),
-        Column("sigma", format=".5f", key="sigma_2"),
-        Column("unit", key="unit_2"),
+        Column("value", format=",.6g"),
+        Column("sigma", format=",.3g", beside=True),
+        Column("unit", beside=True),
+        Column("value", format=",.6g", key="value_2"),
+        Column("sigma", format=",.3g", key="sigma_2", beside=True),
+        Column("unit", key="unit_2", beside=True),
     )
     return Table("Engineering view", columns, tuple(rows), (_reference(result),))
 
@@ -141,7 +144,7 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
     columns = (
         Column("parameter"),
         Column("slope", format=",.2f"),
-        Column("sigma", format=",.2f"),
+        Column("sigma", format=",.2f", beside=True),
         Column("unit"),
     )
     note = (
@@ -169,10 +172,12 @@ def fit(result: Calibration) -> Table:
     if not result.settings.get("polish", True):
         rows.pop(6)
     if result.noise_ratio is not None:
-        rows.insert(3, ("s over the scatter within poses", f"{result.noise_ratio:.3g}", ""))
+        rows.insert(3, ("s over scatter within poses", f"{result.noise_ratio:.3g}", ""))
         rows.insert(4, ("chance of that ratio or more", f"{result.noise_chance:.2g}", ""))
     notes = (f"Before: {result.before}.",)
-    return Table("Fit", (Column("quantity"), Column("value"), Column("unit")), tuple(rows), notes)
+    return Table(
+        "Fit", (Column("quantity"), Column("value"), Column("unit", beside=True)), tuple(rows), notes
+    )
 
 
 def observability(result: Calibration) -> Table:

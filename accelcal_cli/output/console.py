@@ -42,31 +42,38 @@ def console(file: IO[str] | None = None) -> Console:
 
 
 def show(tables: Iterable[Table], out: Console) -> None:
-    """Draw tables one under the other, each with its notes; one too wide for the terminal row by row."""
+    """Draw tables one under the other, each with its notes."""
     for table in tables:
-        if _natural_width(table) > out.width:
-            _show_stacked(table, out)
-        elif table.columns:
-            out.print(_drawn(table, out), crop=False)
-        for note in table.notes:
-            out.print(Text(note))
-        out.print()
+        show_split(table, out)
 
 
 def show_split(table: Table, out: Console) -> None:
-    """Draw a table; one too wide for the terminal in parts, each with the first column again."""
-    others = len(table.columns) - 1
-    first, start = True, 0
-    while start < others:
-        end = others
-        while end > start + 1 and _natural_width(_part(table, start, end)) > out.width:
-            end -= 1
-        part = _part(table, start, end)
-        out.print(_drawn(part if first else replace(part, title=""), out), crop=False)
-        first, start = False, end
+    """Draw a table with its notes; one too wide for the terminal in parts, each with the first column again."""
+    parts = _parts(table, out.width)
+    for part in parts:
+        out.print(_drawn(part, out), crop=False)
+    if not parts:
+        _show_stacked(table, out)
     for note in table.notes:
         out.print(Text(note))
-    out.print()
+    if table.notes or not parts:
+        out.print()
+
+
+def _parts(table: Table, width: int) -> list[Table]:
+    """Return the parts of a table that fit into a width; none when there is a column too wide for it."""
+    others = len(table.columns) - 1
+    ends = [i for i in range(1, others + 1) if i == others or not table.columns[i + 1].beside]
+    parts: list[Table] = []
+    start = 0
+    while start < others:
+        fit = [end for end in ends if end > start and _natural_width(_part(table, start, end)) <= width]
+        if not fit:
+            return []
+        part = _part(table, start, fit[-1])
+        parts.append(replace(part, title="") if parts else part)
+        start = fit[-1]
+    return parts
 
 
 def _part(table: Table, start: int, end: int) -> Table:
@@ -79,7 +86,7 @@ def _part(table: Table, start: int, end: int) -> Table:
 def _natural_width(table: Table) -> int:
     """Return the characters that a table needs without wrapping a cell."""
     widths = _widths(_cells(table))
-    return sum(widths) + 3 * len(widths) + 1
+    return sum(widths) + 3 * len(widths)
 
 
 def _cells(table: Table) -> list[list[str]]:
@@ -99,7 +106,7 @@ def _widths(cells: list[list[str]]) -> list[int]:
 
 
 def _show_stacked(table: Table, out: Console) -> None:
-    """Print every row as a heading and one line a column, so that a narrow terminal loses no digit."""
+    """Print every row as a heading and one line a column, so that the narrowest terminal loses no digit."""
     out.print(Text(table.title, "bold"))
     for row in table.rows:
         first, *rest = zip(table.columns, row, strict=True)
@@ -127,7 +134,7 @@ def _drawn(table: Table, out: Console) -> Text:
     heads = len(cells) - len(table.rows)
     line = "\u2500" if out.encoding.lower().startswith("utf") else "-"
     rule = " " + line * (sum(widths) + 3 * len(widths) - 1)
-    title = [table.title, ""] if table.title else [""]
+    title = [table.title, ""] if table.title else []
     head, body = "\n".join([*title, *lines[:heads]]), "\n".join([rule, *lines[heads:], ""])
     return Text.assemble((head, "bold"), "\n", body, no_wrap=True, overflow="ignore")
 
