@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -14,7 +14,9 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.registry import build
-from accelcal_cli.sensor.simulation import Sensor
+
+if TYPE_CHECKING:
+    from accelcal_cli.sensor.simulation import Sensor
 
 CONFIGS = Path(__file__).parent / "configs"
 """The shipped configurations, inside the installed package."""
@@ -148,6 +150,8 @@ def load_sensor(name: str) -> Sensor:
     Raises:
         ConfigError: neither such a configuration nor such a file, or one that says something unknown.
     """
+    from accelcal_cli.sensor.simulation import Sensor
+
     files = shipped("sensors")
     path = files.get(name, Path(name))
     if name not in files and not path.suffix:

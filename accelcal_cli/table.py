@@ -16,12 +16,14 @@ class Column:
         unit: unit shown under or behind the heading; empty when it has none.
         format: format specification of a numeric cell, as in `format(value, spec)`.
         key: name of the column in machine-readable output; the heading when not given.
+        beside: it belongs to the column before it; a table that is too wide is not cut between them.
     """
 
     name: str
     unit: str = ""
     format: str = ""
     key: str = ""
+    beside: bool = False
 
     def text(self, value: Any) -> str:
         """Return the cell as a person reads it; a missing value is a dash."""

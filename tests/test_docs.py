@@ -27,7 +27,8 @@ import pytest
 import typer.main
 import yaml
 
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
 from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.cli.main import app

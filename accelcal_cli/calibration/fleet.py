@@ -168,12 +168,14 @@ def _calibrated(
     seen = Observabilities.of(information, batch.count)
     freedom = batch.count - 9
     variance = np.where(freedom > 0, run.cost / (4.0 * g**2) / np.maximum(freedom, 1), np.nan)
-    finite = np.isfinite(seen.dop[:, :, None] * seen.dop[:, None, :])
-    covariance = np.where(finite, variance[:, None, None] * seen.cofactor, np.nan)
+    walled = np.any(at_edge(run.x), axis=1)
+    # What stops at a wall of its box is not the least-squares answer.
+    firm = quality.firm(seen.dop, seen.verdicts, np.sqrt(variance), g) & ~walled[:, None]
+    covariance = np.where(firm[:, :, None] & firm[:, None], variance[:, None, None] * seen.cofactor, np.nan)
     K = to_gauge(lower, settings.gauge)
     verdict = [
-        final_verdict(word, bool(at_edge(x).any()), int(left))
-        for word, x, left in zip(seen.verdicts, run.x, freedom, strict=True)
+        final_verdict(word, bool(wall), int(left))
+        for word, wall, left in zip(seen.verdicts, walled, freedom, strict=True)
     ]
     rms, rms_before, outlying = residuals(readings, batch, lower, D, start, seen, weights, settings)
     part = Fleet(

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from accelcal_cli.calibration import quality
-from accelcal_cli.calibration.assemble import taken_for
 from accelcal_cli.calibration.lotters import Loetters
-from accelcal_cli.calibration.nominal import Start
+from accelcal_cli.calibration.nominal import Start, taken_for
 from accelcal_cli.calibration.quality import Observabilities
 from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
 from accelcal_cli.calibration.settings import Settings

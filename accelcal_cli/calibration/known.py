@@ -16,11 +16,6 @@ from accelcal_cli.calibration.quality import RANK_TOLERANCE
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.streams import Float
 
-NEAR_G = 0.05
-"""Largest part by which the mean length of the reference may differ from g: more is another unit."""
-
-FEWEST_POSES = 6
-
 
 @dataclass(frozen=True)
 class Linear:

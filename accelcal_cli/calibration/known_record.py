@@ -7,13 +7,13 @@ from dataclasses import asdict
 import numpy as np
 
 from accelcal_cli import __version__
-from accelcal_cli.calibration import quality
-from accelcal_cli.calibration.assemble import nominal_before
 from accelcal_cli.calibration.known import Linear, fit
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS
-from accelcal_cli.calibration.quality import PARAMETERS, UNDETERMINED, WEAK
+from accelcal_cli.calibration.nominal import nominal_before
+from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
+from accelcal_cli.calibration.quality import UNDETERMINED, WEAK
 from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import pose_weights
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
@@ -92,7 +92,7 @@ def _assembled(
         f_0=model.f_0,
         gauge="full",
         sigma=Sigma(sigma_K, found.s * size * dop[3]),
-        dop=_dop(np.sqrt(np.diagonal(cofactor))),
+        dop=Dop.of(np.sqrt(np.diagonal(cofactor))),
         verdict=_verdict(dop, found.freedom),
         reasons=_reasons(dop, found.freedom),
         suggestions=(),
@@ -149,12 +149,6 @@ def _nine(model: ErrorModel) -> Float:
         column = [both[i, j] * (0.5 if i == j else 1.0) for i, j in ROWS_COLUMNS[:6]]
         columns.append([*column, *(model.K @ Y[:, 3] / np.diagonal(low))])
     return np.array(columns).T
-
-
-def _dop(dop: Float) -> Dop:
-    kinds = (quality.MISALIGNMENT, quality.SCALE, quality.BIAS)
-    misalignment, scale, bias = (float(dop[kind].max()) for kind in kinds)
-    return Dop(misalignment, scale, bias, float(dop.max()), dict(zip(PARAMETERS, dop.tolist(), strict=True)))
 
 
 def _verdict(dop: Float, freedom: int) -> str:

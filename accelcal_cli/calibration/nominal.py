@@ -11,7 +11,7 @@ from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
 from accelcal_cli.calibration.quality import Observabilities, information
 from accelcal_cli.calibration.settings import BoxSettings, Settings
-from accelcal_cli.sensor.model import to_gauge
+from accelcal_cli.sensor.model import ErrorModel, to_gauge
 from accelcal_cli.streams import Bool, Float, Int, Streams
 
 BOX_PURPOSE = 1
@@ -121,3 +121,36 @@ def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Floa
     mean = scale.mean(axis=-1, keepdims=True)
     turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
     return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
+
+
+def nominal_before(scale: float, D: Float, settings: Settings) -> tuple[str, ErrorModel]:
+    """Return what the readings are taken for before calibration, in words and as a model.
+
+    A stated nominal sensor; else, for readings that are specific force already, themselves; else one scale
+    factor for all axes and the bias in the middle, which is what a user without calibration could do.
+
+    Args:
+        scale: mean scale factor, output units per m/s^2; D: bias, output units, shape (3,).
+        settings: may state a nominal sensor.
+    """
+    k, bias, words = taken_for(np.array([scale]), D[None], settings)
+    return words[0], ErrorModel(np.diag(k[0]), bias[0])
+
+
+def taken_for(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:
+    """Return scale factors and biases, shape (R, 3), and words of what readings of R sensors are taken for.
+
+    See `nominal_before`; scale has the shape (R,), D (R, 3).
+    """
+    if settings.nominal is not None:
+        k, bias = (np.broadcast_to(v, D.shape) for v in (settings.nominal.scale, settings.nominal.bias))
+        return k, bias, ["the stated nominal sensor"] * len(D)
+    # A nominal scale factor carries no more than three significant digits.
+    rounded = np.array([float(f"{value:.3g}") for value in scale.tolist()])
+    force = (rounded > 0.8) & (rounded < 1.25)  # specific force already, in m/s^2 or in g
+    words = "one scale factor for all axes and the estimated bias, no misalignment"
+    return (
+        np.repeat(np.where(force, 1.0, rounded)[:, None], 3, axis=1),
+        np.where(force[:, None], 0.0, D),
+        ["the readings as they are" if f else words for f in force],
+    )

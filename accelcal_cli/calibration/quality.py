@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS, Loetters, pack
-from accelcal_cli.streams import Float, Int
+from accelcal_cli.streams import Bool, Float, Int
 
 PARAMETERS = (
     "scale factor x",
@@ -52,6 +52,24 @@ def verdict_of(worst: float, rank: int) -> Verdict:
     if rank < 9 or worst > UNDETERMINED:
         return "undetermined"
     return "weak" if worst > WEAK else "good"
+
+
+def firm(dop: Float, verdict: Sequence[Verdict], s: Float, g: float) -> Bool:
+    """Return which of the nine parameters of R sensors the linear covariance holds for, shape (R, 9).
+
+    Poses that leave a direction open leave a valley of almost equal cost, and the valley bends: an error d along
+    it moves every other parameter by about d^2 / 2g. Where that is more than their own error, or d is without
+    bound, the covariance tells less than what chance decides.
+
+    Args:
+        dop: dilution of precision, shape (R, 9); verdict: on the poses, R of them.
+        s: standard deviation of one pose's modulus, m/s^2, shape (R,); g: local gravity, m/s^2.
+    """
+    worst = dop.max(axis=1, keepdims=True)
+    bounded = np.isfinite(worst)
+    bend = (s[:, None] * np.where(bounded, worst, 0.0)) ** 2 / (2.0 * g)
+    poor = np.array([word == "undetermined" for word in verdict], dtype=bool)
+    return np.where(poor[:, None], bounded & (s[:, None] * dop >= bend), True)
 
 
 PRIOR = 1e-6

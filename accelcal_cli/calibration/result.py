@@ -2,67 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from accelcal_cli.calibration import record as records
-from accelcal_cli.calibration.quality import Verdict
+from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
+from accelcal_cli.calibration.quality import UNDETERMINED
+from accelcal_cli.calibration.rebuild import checked
 from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor.model import GAUGES, ErrorModel
+from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.streams import Float
 
 SCHEMA = "accelcal/calibration/1"
 """Name and version of the record; a reader refuses what it does not know."""
-
-
-@dataclass(frozen=True)
-class Sigma:
-    """One-sigma of the parameters; NaN where the poses do not determine them.
-
-    Attributes:
-        K_a: shape (3, 3), output units per m/s^2.
-        D_a: shape (3,), output units.
-    """
-
-    K_a: Float
-    D_a: Float
-
-
-@dataclass(frozen=True)
-class Dop:
-    """Dilution of precision: the error of a parameter, as m/s^2 at 1 g, over the noise of one pose in m/s^2.
-
-    Attributes:
-        misalignment, scale, bias: the largest of each kind.
-        worst: the largest of all.
-        parameters: each of the nine by its name.
-    """
-
-    misalignment: float
-    scale: float
-    bias: float
-    worst: float
-    parameters: dict[str, float]
-
-
-@dataclass(frozen=True)
-class PoseFit:
-    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual;
-    |f| - g before calibration, and the unit direction of the specific force, gauge `lower`."""
-
-    pose: int
-    where: str
-    residual: float
-    studentised: float
-    leverage: float
-    left_out: float
-    residual_before: float
-    direction: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -80,7 +37,7 @@ class Calibration:
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
-        covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9).
+        covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9); NaN where they have no sigma.
         information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
@@ -144,6 +101,17 @@ class Calibration:
         """Unit of the specific force: g when the readings were calibrated against g = 1."""
         return "g" if self.g == 1.0 else "m/s^2"
 
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Which of the nine parameters are not determined, shape (9,).
+
+        Definition: in an undetermined result, dilution of precision above 25, or no sigma.
+        """
+        if self.verdict != "undetermined":
+            return np.zeros(9, dtype=bool)
+        poor: NDArray[np.bool_] = np.array(list(self.dop.parameters.values())) > UNDETERMINED
+        return poor | np.isnan(np.diagonal(self.covariance))
+
     def check_determined(self, name: str, *, force: bool = False) -> None:
         """Refuse to be used where the poses left parameters undetermined, unless forced.
 
@@ -174,79 +142,4 @@ class Calibration:
         missing = [f.name for f in fields(cls) if f.name not in record]
         if missing:
             raise DataError(f"{where}: not a whole calibration result; missing: {', '.join(missing)}")
-        return cls(**{f.name: _checked(f.name, record[f.name], where) for f in fields(cls)})
-
-
-SHAPES = {
-    "K_a": (3, 3),
-    "D_a": (3,),
-    "K_A": (3, 3),
-    "f_0": (3,),
-    "covariance": (9, 9),
-    "information": (9, 9),
-    "nominal_scale": (3,),
-    "nominal_bias": (3,),
-}
-WHOLE = ("K_a", "D_a", "K_A", "f_0", "information")
-"""Arrays in which a missing number is a fault of the file."""
-
-CHOICES = {"gauge": GAUGES, "verdict": get_args(Verdict)}
-NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
-
-KINDS: dict[str, tuple[tuple[type, ...], str]] = {
-    **dict.fromkeys(("freedom", "poses", "evaluations", "runs", "runs_agreeing"), ((int,), "a whole number")),
-    **dict.fromkeys(("reasons", "suggestions", "notes", "outliers", "poses_fit"), ((list,), "a list")),
-    **dict.fromkeys(("data", "settings"), ((dict,), "a mapping")),
-    **dict.fromkeys(("before", "optimizer", "version"), ((str,), "text")),
-    **dict.fromkeys(("noise_ratio", "noise_chance"), ((int, float, type(None)), "a number")),
-}
-
-
-def _checked(name: str, value: Any, where: str) -> Any:
-    try:
-        return _rebuild(name, value)
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise DataError(f"{where}: not a calibration result: {name}: {reason}") from None
-
-
-def _rebuild(name: str, value: Any) -> Any:
-    if name in SHAPES:
-        return _matrix(name, value)
-    if name in KINDS:
-        records.of_kind(value, *KINDS[name])
-    if name == "sigma":
-        return Sigma(records.array(value["K_a"], (3, 3)), records.array(value["D_a"], (3,)))
-    if name in CHOICES and value not in CHOICES[name]:
-        raise ValueError(f"{value!r} is not one of {', '.join(CHOICES[name])}")
-    if name == "g" and not 0 < records.of_kind(value, (int, float), "a positive number") < math.inf:
-        raise ValueError(f"{value!r} where a positive number was expected")
-    if name == "temperature" and value is not None:
-        return Temperature.from_record(value)
-    if name == "dop":
-        parameters = {key: records.or_infinite(v) for key, v in value["parameters"].items()}
-        kinds = {
-            kind: records.or_infinite(value[kind]) for kind in ("misalignment", "scale", "bias", "worst")
-        }
-        return Dop(**kinds, parameters=parameters)
-    if name == "poses_fit":
-        return tuple(_pose_fit(row) for row in value)
-    if name == "convergence":
-        return tuple((int(n), float(cost)) for n, cost in value)
-    if name in NUMBERS_OR_NAN:
-        return records.or_nan(value)
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _pose_fit(row: Mapping[str, Any]) -> PoseFit:
-    """Return one pose; a key too many or too few is a TypeError."""
-    direction = records.array(row["direction"], (3,), whole=True)
-    known: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
-    return PoseFit(**{**known, "direction": tuple(direction.tolist())})
-
-
-def _matrix(name: str, value: Any) -> Float:
-    found = records.array(value, SHAPES[name], whole=name in WHOLE)
-    if name == "K_a" and np.linalg.matrix_rank(found) < 3:
-        raise ValueError("is singular; expected an invertible matrix")
-    return found
+        return cls(**{f.name: checked(f.name, record[f.name], where) for f in fields(cls)})

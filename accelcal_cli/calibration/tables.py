@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.calibration.quality import UNDETERMINED, WEAK
+from accelcal_cli.calibration.quality import PARAMETERS, UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.sensor import units
@@ -41,7 +41,10 @@ def parameters(result: Calibration) -> Table:
         rows.append(row)
     columns = [Column("axis")]
     for name in ("K_x", "K_y", "K_z", "bias"):
-        columns += [Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}")]
+        columns += [
+            Column(name, format=".8g"),
+            Column("sigma", format=".2g", key=f"sigma_{name}", beside=True),
+        ]
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
@@ -52,18 +55,13 @@ def parameters(result: Calibration) -> Table:
     return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
 
 
-def _lost(result: Calibration) -> NDArray[np.bool_]:
-    """Return which of the nine parameters are undetermined, shape (9,): all of them with fewer than nine poses."""
-    return (np.array(list(result.dop.parameters.values())) > UNDETERMINED) | (result.freedom < 0)
-
-
 def _undetermined(result: Calibration) -> NDArray[np.bool_]:
     """Return which entries of K_a (rows 0 to 2) and D_a (row 3) the poses leave undetermined, shape (4, 3)."""
-    dop = _lost(result)
+    nine = result.lost
     lost = np.zeros((4, 3), dtype=bool)
     for p, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))):
-        lost[i, j] = lost[j, i] = dop[p]
-    lost[3] = dop[6:]
+        lost[i, j] = lost[j, i] = nine[p]
+    lost[3] = nine[6:]
     lost[:3] &= result.K_a != 0  # a zero of the gauge is exact
     return lost
 
@@ -79,53 +77,40 @@ def engineering(result: Calibration) -> Table:
     """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
-    sigma = np.sqrt(np.diagonal(result.covariance))
     # In gauge lower, as their sigma: another gauge, above all the free rotation of gauge full, moves a scale factor
     # by half the square of the misalignments, which is many times that sigma.
     K = result.model.in_gauge("lower").K
-    scale = units.scale_error(K, result.nominal_scale)
     angle = units.misalignment(K)
-    bias = units.bias_force(K, result.D_a - result.nominal_bias)
-    lost = _lost(result)
-    sigma = np.where(lost, np.nan, sigma)
-    rows = [_row(f"scale factor error {AXES[i]}", scale[i], sigma[i] / per_g, "ppm", "%") for i in range(3)]
-    for p, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
-        value = angle[i, j] + angle[j, i]
-        rows.append(_row(f"misalignment {AXES[i]}{AXES[j]}", value, sigma[3 + p] / per_g, "mrad", "arcsec"))
-    for i in range(3):
-        row = _row(
-            f"bias {AXES[i]}", bias[i] / per_g, sigma[6 + i] / per_g, "micro-g", "m/s^2", metres * per_g
-        )
-        rows.append(row)
+    angles = [angle[i, j] + angle[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    bias = units.bias_force(K, result.D_a - result.nominal_bias) / per_g
+    values = np.concatenate([units.scale_error(K, result.nominal_scale), angles, bias])
+    sigma = np.sqrt(np.diagonal(result.covariance)) / per_g
+    shown = (
+        ("scale factor error", "ppm", units.PPM, "%", 100.0),
+        ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
+        ("bias", "micro-g", units.MICRO_G, "m/s^2", metres * per_g),
+    )
+    rows = []
+    for p, name in enumerate(PARAMETERS):
+        kind, unit, factor, second, second_factor = shown[p // 3]
+        pair = _pair(values[p], sigma[p], lost=bool(result.lost[p]))
+        first, again = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
+        rows.append((f"{kind} {name.split()[-1]}", *first, unit, *again, second))
     columns = (
         Column("parameter"),
-        Column("value", format=",.1f"),
-        Column("sigma", format=",.1f"),
-        Column("unit"),
-        Column("value", format=".5f", key="value_2"),
-        Column("sigma", format=".5f", key="sigma_2"),
-        Column("unit", key="unit_2"),
+        Column("value", format=",.6g"),
+        Column("sigma", format=",.3g", beside=True),
+        Column("unit", beside=True),
+        Column("value", format=",.6g", key="value_2"),
+        Column("sigma", format=",.3g", key="sigma_2", beside=True),
+        Column("unit", key="unit_2", beside=True),
     )
     return Table("Engineering view", columns, tuple(rows), (_reference(result),))
 
 
-def _row(
-    name: str, value: float, sigma: float, unit: str, second: str, force: float = 1.0
-) -> tuple[object, ...]:
-    """Return one row: value and sigma in two units; `force` is what one g is in the second unit of a bias."""
-    first_factor = {"ppm": units.PPM, "mrad": units.MRAD, "micro-g": units.MICRO_G}[unit]
-    second_factor = {"%": 100.0, "arcsec": units.ARCSEC, "m/s^2": force}[second]
-    if not np.isfinite(sigma):
-        return (name, UNKNOWN, None, unit, UNKNOWN, None, second)
-    return (
-        name,
-        value * first_factor,
-        sigma * first_factor,
-        unit,
-        value * second_factor,
-        sigma * second_factor,
-        second,
-    )
+def _times(cell: object, factor: float) -> object:
+    """Return a number times a factor; words and nothing as they are."""
+    return cell * factor if isinstance(cell, float) else cell
 
 
 def _reference(result: Calibration) -> str:
@@ -159,7 +144,7 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
     columns = (
         Column("parameter"),
         Column("slope", format=",.2f"),
-        Column("sigma", format=",.2f"),
+        Column("sigma", format=",.2f", beside=True),
         Column("unit"),
     )
     note = (
@@ -187,10 +172,12 @@ def fit(result: Calibration) -> Table:
     if not result.settings.get("polish", True):
         rows.pop(6)
     if result.noise_ratio is not None:
-        rows.insert(3, ("s over the scatter within poses", f"{result.noise_ratio:.3g}", ""))
+        rows.insert(3, ("s over scatter within poses", f"{result.noise_ratio:.3g}", ""))
         rows.insert(4, ("chance of that ratio or more", f"{result.noise_chance:.2g}", ""))
     notes = (f"Before: {result.before}.",)
-    return Table("Fit", (Column("quantity"), Column("value"), Column("unit")), tuple(rows), notes)
+    return Table(
+        "Fit", (Column("quantity"), Column("value"), Column("unit", beside=True)), tuple(rows), notes
+    )
 
 
 def observability(result: Calibration) -> Table:
@@ -235,14 +222,20 @@ def worst_poses(result: Calibration) -> Table:
 
 
 def values(result: Calibration) -> Table:
-    """Return the parameters one a row, for CSV."""
-    unit = f"output units per {result.unit}"
+    """Return the parameters one a row, for CSV; one that is not determined has no value."""
+    lost = _undetermined(result)
+    names = [f"K_{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)] + ["D_1", "D_2", "D_3"]
+    entries = (
+        np.concatenate([result.K_a, [result.D_a]]),
+        np.concatenate([result.sigma.K_a, [result.sigma.D_a]]),
+    )
+    units_ = [f"output units per {result.unit}"] * 9 + ["output units"] * 3
     rows: list[tuple[object, ...]] = [
-        (f"K_{i + 1}{j + 1}", result.K_a[i, j], result.sigma.K_a[i, j], unit)
-        for i in range(3)
-        for j in range(3)
+        (name, None if gone else value, None if gone else sigma, unit)
+        for name, value, sigma, gone, unit in zip(
+            names, *(e.ravel().tolist() for e in entries), lost.ravel().tolist(), units_, strict=True
+        )
     ]
-    rows += [(f"D_{i + 1}", result.D_a[i], result.sigma.D_a[i], "output units") for i in range(3)]
     rows += [
         ("cost", result.cost, None, f"({result.unit})^4"),
         ("rms", result.rms, None, result.unit),
@@ -250,5 +243,4 @@ def values(result: Calibration) -> Table:
         ("verdict", result.verdict, None, ""),
     ]
     columns = (Column("parameter"), Column("value"), Column("sigma"), Column("unit"))
-    plain = [tuple(v.item() if isinstance(v, np.generic) else v for v in row) for row in rows]
-    return Table("Calibration", columns, tuple(plain))
+    return Table("Calibration", columns, tuple(rows))

@@ -53,7 +53,7 @@ def reasons_of(
         lines.append(
             f"Nine poses fit exactly and say nothing of their noise: no sigma. Take at least {FEWEST_POSES}."
         )
-    if edge:
+    if edge and seen.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
         lines.append(
             f"The least cost lies outside the search box, beyond {', '.join(edge)}: "
             "widen the box or state the nominal sensor (--config, keys box and nominal)."

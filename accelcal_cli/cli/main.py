@@ -5,29 +5,16 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
 from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.core
+import typer.main
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import (
-    apply,
-    benchmark,
-    calibrate,
-    capture,
-    compare,
-    detect,
-    export,
-    fleet,
-    navigate,
-    optimizers,
-    plan,
-    report,
-    reproduce,
-    simulate,
-    verify,
-)
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -40,8 +27,66 @@ BadUsage: type[Exception] = typer.BadParameter.__bases__[0]
 """What typer raises for an unknown command or option, or a value of the wrong type."""
 
 
+NAMES = (
+    "calibrate",
+    "simulate",
+    "detect",
+    "apply",
+    "verify",
+    "capture",
+    "plan",
+    "fleet",
+    "report",
+    "export",
+    "benchmark",
+    "compare",
+    "reproduce",
+    "optimizers",
+    "navigate",
+)
+"""The commands in the order of the help page; each is the function `command` of the module of its name."""
+
+HOUSE: dict[str, Any] = {
+    "pretty_exceptions_enable": False,
+    "rich_markup_mode": None,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+"""What the program and every command of it are made with."""
+
+
+@cache
+def _build(name: str) -> Any:
+    """Return the parsed form of one command."""
+    alone = typer.Typer(add_completion=False, **HOUSE)
+    alone.command(name)(import_module(f"accelcal_cli.cli.{name}").command)
+    return typer.main.get_command(alone)
+
+
+class Made(Mapping[str, Any]):
+    """The commands by name, each imported and built when it is asked for: a calibration pays for no other."""
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a command."""
+        if name not in NAMES:
+            raise KeyError(name)
+        return _build(name)
+
+    def __iter__(self) -> Iterator[str]:
+        """Go through the names."""
+        return iter(NAMES)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(NAMES)
+
+
 class Commands(typer.core.TyperGroup):
     """The commands; keeps typer from taking a reader that left (`| head -1`) for a failure."""
+
+    def __init__(self, **attributes: Any) -> None:
+        """Make the group of all commands."""
+        super().__init__(**attributes)
+        self.commands = Made()  # type: ignore[assignment]  # only ever read
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; leave quietly when the reader of its output has gone."""
@@ -56,25 +101,8 @@ app = typer.Typer(
     cls=Commands,
     help="Calibrate three-axis accelerometers without a turntable.",
     no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    **HOUSE,
 )
-app.command("calibrate")(calibrate.command)
-app.command("simulate")(simulate.command)
-app.command("detect")(detect.command)
-app.command("apply")(apply.command)
-app.command("verify")(verify.command)
-app.command("capture")(capture.command)
-app.command("plan")(plan.command)
-app.command("fleet")(fleet.command)
-app.command("report")(report.command)
-app.command("export")(export.command)
-app.command("benchmark")(benchmark.command)
-app.command("compare")(compare.command)
-app.command("reproduce")(reproduce.command)
-app.command("optimizers")(optimizers.command)
-app.command("navigate")(navigate.command)
 
 
 def _version(wanted: bool) -> None:

@@ -97,7 +97,7 @@ def _framed(lines: Sequence[str], levels: tuple[str, str], ends: tuple[float, fl
     """Return lines of a plot with the costs of its first and last line and the evaluations of its ends."""
     width = len(lines[0])
     labels = [levels[0], *[""] * (len(lines) - 2), levels[1]]
-    body = [f"{text:>7} |{line}" for text, line in zip(labels, lines, strict=True)]
+    body = [f"{text:>7} |{line}".rstrip() for text, line in zip(labels, lines, strict=True)]
     foot = f"{ends[0]:,.0f}".ljust(width - 12) + f"{ends[1]:,.0f}".rjust(12)
     return "\n".join([*body, " " * 8 + "+" + "-" * width, " " * 9 + foot + "  evaluations"])
 

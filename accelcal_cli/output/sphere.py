@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accelcal_cli.calibration.result import Calibration, PoseFit
+from accelcal_cli.calibration.parts import PoseFit
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.output import svg
 from accelcal_cli.streams import Float
 

@@ -236,17 +236,33 @@ def test_poses_that_determine_too_little_say_so_and_what_would_mend_it(name, sig
     _close(mended, DPSO, 1e-9 if sigma == 0 else 4 * sigma * mended.dop.worst / G)
 
 
+@pytest.mark.parametrize("sigma", [0.0, 1e-4, 2e-2])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_no_number_of_poor_poses_is_surer_than_it_is_right(name, sigma):
+    """What is given a sigma is right within ten of them: the valley that the poses leave open bends."""
+    u, _ = DEGENERATE[name]
+    truth = DPSO.in_gauge("lower")
+    for seed in range(3):
+        result = calibrate(readings(u, sigma=sigma, seed=seed), _fast(seed=seed))
+        assert result.lost.any()
+        off = np.concatenate([np.abs(result.K_a - truth.K), np.abs(result.D_a - truth.D)[None]])
+        told = np.concatenate([result.sigma.K_a, result.sigma.D_a[None]])
+        known = np.isfinite(told)
+        assert (off[known] <= 10 * told[known] + 1e-9 * 5.67e5).all()
+
+
 def test_what_is_undetermined_has_no_sigma():
     """Without degrees of freedom no sigma at all; with them none for what the poses do not determine."""
     result = calibrate(readings(poses.faces(), sigma=1e-3), FAST)
     assert np.isnan(result.s)
     assert np.isnan(result.sigma.K_a[np.tril_indices(3)]).all()
     result = calibrate(readings(np.repeat(poses.faces(), 4, axis=0)), FAST)
-    assert np.isnan(result.sigma.K_a[np.tril_indices(3, -1)]).all()
-    assert np.isfinite(result.sigma.D_a).all()
-    # Noise alone tells the faces apart, and its sigma says what that is worth: more than a tenth of the scale.
+    assert np.isnan(result.sigma.K_a[np.tril_indices(3)]).all()
+    assert np.isnan(result.sigma.D_a).all()
+    # Noise alone tells the faces apart, and drives the misalignments to the walls.
     result = calibrate(readings(np.repeat(poses.faces(), 4, axis=0), sigma=1e-3), FAST)
-    assert np.nanmax(result.sigma.K_a) > 0.1 * 5.67e5
+    assert np.isnan(result.sigma.D_a).all()
+    assert result.lost.all()
 
 
 def test_weak_poses_warn_and_still_give_numbers():

@@ -126,8 +126,20 @@ def test_what_is_not_determined_is_not_shown_as_a_number():
     assert result.verdict == "undetermined"
     assert tables.UNKNOWN in _cells(tables.engineering(result))["misalignment xy"]
     assert tables.UNKNOWN in [value for row in tables.parameters(result).rows for value in row]
-    words = [row[2] for row in tables.observability(result).rows]
-    assert "undetermined" in words
+    assert {row[2] for row in tables.observability(result).rows} >= {"undetermined", "good"}
+    empty = {row[0] for row in tables.values(result).rows if row[1] is None}
+    below = {f"K_{i}{j}" for i in (1, 2, 3) for j in range(1, i + 1)}
+    assert empty == below | {"D_1", "D_2", "D_3"}
+
+
+def test_nine_poses_have_values_without_sigma():
+    result = calibrate(readings(poses.fibonacci(9), sigma=1e-3), _settings())
+    assert result.verdict == "weak"
+    for table in (tables.parameters(result), tables.engineering(result), tables.values(result)):
+        assert tables.UNKNOWN not in [cell for row in table.rows for cell in row]
+    value, sigma, *_ = _cells(tables.engineering(result))["scale factor error x"]
+    assert value == pytest.approx((result.K_a[0, 0] / result.nominal_scale[0] - 1) * 1e6)
+    assert sigma is None
 
 
 def test_the_values_for_csv_are_all_there(result):
