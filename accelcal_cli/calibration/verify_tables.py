@@ -43,7 +43,7 @@ def _row(d: Difference, result: Verification) -> tuple[object, ...]:
     return (d.name, d.value * factor + 0.0, d.sigma * abs(factor), unit, d.chance, d.adjusted, changed)
 
 
-def tests(result: Verification) -> Table:
+def evidence(result: Verification) -> Table:
     """Return what the verdict rests on."""
     unit = result.unit
     rows: list[tuple[object, ...]] = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from accelcal_cli.calibration.verify import Verification
-from accelcal_cli.calibration.verify_tables import differences, tests
+from accelcal_cli.calibration.verify_tables import differences, evidence
 from accelcal_cli.output import console as rich_console
 
 
@@ -13,4 +13,4 @@ def show_verification(result: Verification) -> None:
     rich_console.verdict(result.verdict, result.reasons, out)
     out.print()
     rich_console.show_split(differences(result), out)
-    rich_console.show([tests(result)], out)
+    rich_console.show([evidence(result)], out)

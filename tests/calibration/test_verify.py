@@ -13,7 +13,7 @@ from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.quality import PARAMETERS, design
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verify import verify
-from accelcal_cli.calibration.verify_tables import differences, tests
+from accelcal_cli.calibration.verify_tables import differences, evidence
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
@@ -154,7 +154,7 @@ def test_the_record_is_plain_and_the_tables_hold_it():
     assert record["differences"][3]["value"] is None
     assert record["result"]["sha256"] != record["data"]["sha256"]
     assert len(differences(found).rows) == 9
-    assert ("tolerance", "0.01", "m/s^2") in tests(found).rows
+    assert ("tolerance", "0.01", "m/s^2") in evidence(found).rows
 
 
 def test_differences_are_those_of_the_matrix_that_the_result_shows():
