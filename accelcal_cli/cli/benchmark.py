@@ -65,10 +65,10 @@ def command(
     format: options.Format = "table",
     quiet: options.Quiet = False,
 ) -> None:
-    """Run optimizers on test functions with known minima, all of them 0.
+    """Run optimizers on test functions with known minima.
 
-    Prints the spread of the cost over the runs, how many reached the tolerance and after how many evaluations, and
-    ranks with a significance test when several optimizers run on several functions.
+    All minima are 0. Prints the spread of the cost over the runs, how many reached the tolerance and after how many
+    evaluations, and ranks with a significance test when several optimizers run on several functions.
     """
     from accelcal_cli.studies.benchmark import Benchmark
     from accelcal_cli.studies.entries import ALL, Budget, choose, words

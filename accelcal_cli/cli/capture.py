@@ -57,11 +57,12 @@ def command(
     output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
     quiet: options.Quiet = False,
 ) -> None:
-    """Take poses from a live sensor: shows what is held, whether it is still, and what is missing.
+    """Take poses from a live sensor, guided.
 
-    Each pose that is held still is averaged; when all are there, one row a pose is written, for accelcal calibrate.
-    Ctrl-C, the end of the input and a lost port end it early; the poses taken until then are written. Exit code 1
-    means that the input ended before all poses were taken.
+    Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged;
+    when all are there, one row a pose is written, for accelcal calibrate. Ctrl-C, the end of the input and a lost
+    port end it early; the poses taken until then are written. Exit code 1 means that the input ended before all
+    poses were taken.
     """
     from accelcal_cli.calibration.planner import FIXTURES
     from accelcal_cli.output.files import check_target

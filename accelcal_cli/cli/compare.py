@@ -94,10 +94,10 @@ def command(
     format: options.Format = "table",
     quiet: options.Quiet = False,
 ) -> None:
-    """Compare optimizers on the same calibrations: simulated sensors, or readings of a real one.
+    """Compare optimizers on the same calibrations.
 
-    Prints how many runs came to the least cost, what that took, and the errors of the parameters; with noise also how
-    near the errors come to the Cramer-Rao bound.
+    Of simulated sensors, or of readings of a real one. Prints how many runs came to the least cost, what that took,
+    and the errors of the parameters; with noise also how near the errors come to the Cramer-Rao bound.
     """
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
     from accelcal_cli.studies.compare import Comparison

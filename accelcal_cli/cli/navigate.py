@@ -84,7 +84,7 @@ def command(
     format: options.Format = "table",
     quiet: options.Quiet = False,
 ) -> None:
-    """Navigate by inertia and gravity, on a simulated or a recorded voyage.
+    """Navigate by inertia and gravity, simulated or recorded.
 
     Prints the position error over hours 3 to 8, the least that any filter could have (the posterior Cramer-Rao bound),
     how many runs lost lock, and whether the claimed spread fits the error (NEES, 2 when it does).

@@ -16,7 +16,7 @@ def command(
     ] = None,
     format: options.Format = "table",
 ) -> None:
-    """List the optimizers: name, family, paper, parameters with defaults."""
+    """List the optimizers, their settings and their papers."""
     from accelcal_cli.output import catalogue as show
     from accelcal_cli.output.plain import json_rows, json_text, write_csv
     from accelcal_cli.studies.catalogue import catalogue, settings

@@ -59,9 +59,10 @@ def command(
     height: options.Height = None,
     format: options.Format = "table",
 ) -> None:
-    """Plan the next poses: those that shrink the worst sigma most, and the sigma to expect after each.
+    """Plan the next poses: those that shrink the worst sigma.
 
-    Exit code 1 means that not even all these poses determine the parameters.
+    Prints them in words and as vectors, and the sigma to expect after each. Exit code 1 means that not even all
+    these poses determine the parameters.
     """
     from accelcal_cli.calibration.planner import FIXTURES
 

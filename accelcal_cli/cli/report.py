@@ -22,10 +22,11 @@ def command(
     ] = None,
     quiet: options.Quiet = False,
 ) -> None:
-    """Write a report: verdict, parameters with sigma, residuals, poses, dilution, convergence, settings, origin.
+    """Write a report of a result: one HTML page with pictures.
 
-    One file without links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the
-    verdict is "undetermined"; the report is written all the same.
+    Verdict, parameters with sigma, residuals, poses, dilution, convergence, settings, origin. One file without
+    links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the verdict is
+    "undetermined"; the report is written all the same.
     """
     from accelcal_cli.config import load_result
     from accelcal_cli.output.files import check_target, whole_file

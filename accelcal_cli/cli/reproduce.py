@@ -36,7 +36,7 @@ def command(
     format: options.Format = "table",
     quiet: options.Quiet = False,
 ) -> None:
-    """Repeat an experiment of the source papers and print it beside the paper's own numbers.
+    """Repeat an experiment of the papers, beside their numbers.
 
     The experiments are the files of configs/studies; what agrees and what does not is told in
     docs/explanation/reproduction.md.

@@ -59,11 +59,11 @@ def command(
     output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
     truth: Annotated[str | None, typer.Option(help="YAML file for the true parameters.")] = None,
 ) -> None:
-    """Simulate static readings of an accelerometer with known errors.
+    """Simulate static readings of a sensor with known errors.
 
-    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them. With --sensors
-    they carry the label of their sensor, and `fleet` calibrates each. With --raw
-    they are a log of time, acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
+    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them. With
+    --sensors they carry the label of their sensor, and `fleet` calibrates each. With --raw they are a log of time,
+    acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
     from accelcal_cli.config import dump, load_sensor
     from accelcal_cli.output.files import check_target, whole_file

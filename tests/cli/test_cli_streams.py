@@ -11,6 +11,8 @@ import sys
 
 import pytest
 
+from accelcal_cli.cli.main import NAMES
+
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-7]m")
 
 
@@ -180,3 +182,9 @@ def test_an_interrupt_is_one_line_and_leaves_no_file(environment, tmp_path, busy
     out, error = program.communicate()
     assert (program.returncode, out, error) == (130, b"", b"accelcal: interrupted\n")
     assert os.listdir(tmp_path) == []
+
+
+def test_the_help_says_what_each_command_does_in_a_whole_sentence(run):
+    listed = run("--help").out.partition("Commands:\n")[2].splitlines()
+    assert len(listed) == len(NAMES)
+    assert all(line.endswith(".") and not line.endswith("...") for line in listed)
