@@ -68,6 +68,7 @@ class Streams:
     def take(self, index: Int) -> Streams:
         """Return the streams of the runs at `index`, going on where they stand."""
         chosen = Streams(self._seed, (self._runs[i] for i in index), self._purpose)
-        if self._started is not None:
-            chosen._started = [self._started[i] for i in index]
+        chosen._started = [
+            self.generators[i] for i in index
+        ]  # shared: what one draws the other does not draw again
         return chosen

@@ -76,3 +76,10 @@ def test_few_rows(rows):
 def test_a_negative_seed_is_refused():
     with pytest.raises(ValueError, match="negative"):
         Streams(-1, [0])
+
+
+def test_what_a_part_has_drawn_is_not_drawn_again():
+    """Also when the part is taken before the first draw."""
+    streams = Streams(0, range(3))
+    first = streams.take(np.array([1])).normal(4, 2)
+    assert (streams.normal(4, 2)[1] != first[0]).all()
