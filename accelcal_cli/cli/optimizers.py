@@ -15,6 +15,7 @@ def command(
         str | None, typer.Argument(help="One optimizer: its settings and what they mean.", show_default="all")
     ] = None,
     format: options.Format = "table",
+    quiet: options.Quiet = False,  # noqa: ARG001  # every command takes it; this one never says more than it lists
 ) -> None:
     """List the optimizers, their settings and their papers."""
     from accelcal_cli.output import catalogue as show

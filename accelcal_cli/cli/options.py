@@ -68,12 +68,12 @@ def gravity(g: float | None, latitude: float | None, height: float | None) -> fl
     return None if latitude is None else normal_gravity(latitude, height or 0.0)
 
 
-def warn_of_moves(readings: Readings) -> None:
-    """Say on standard error when readings look like a raw log, for commands that do not show the notes."""
+def warn_of_moves(readings: Readings, quiet: bool) -> None:
+    """Say on standard error, unless quiet, when readings look like a raw log; for commands without notes."""
     from accelcal_cli.sensor.collect import EACH_ROW
 
     for note in readings.notes:
-        if note.startswith(EACH_ROW):
+        if note.startswith(EACH_ROW) and not quiet:
             typer.echo(f"accelcal: {readings.source}: {note}", err=True)
 
 

@@ -58,6 +58,7 @@ def command(
     latitude: options.Latitude = None,
     height: options.Height = None,
     format: options.Format = "table",
+    quiet: options.Quiet = False,
 ) -> None:
     """Plan the next poses: those that shrink the worst sigma.
 
@@ -76,14 +77,14 @@ def command(
     if poses is not None and add is not None:
         raise UsageError("--poses and --add: expected one of them, not both")
     stated_g = options.gravity(g, latitude, height)
-    so_far = _so_far(data, columns, stated_g) if data is not None else None
+    so_far = _so_far(data, columns, stated_g, quiet) if data is not None else None
     found = _plan(so_far, poses, add, fixture, noise, stated_g)
     _show(found, format)
     if found.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
 
 
-def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
+def _so_far(data: str, columns: str | None, g: float | None, quiet: bool) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.pipeline import calibrate
     from accelcal_cli.config import load_result, load_settings
@@ -98,7 +99,7 @@ def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
     options.check_input(data)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
-    options.warn_of_moves(readings)
+    options.warn_of_moves(readings, quiet)
     return calibrate(readings, settings)
 
 

@@ -58,6 +58,7 @@ def command(
     seed: options.Seed = 0,
     output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
     truth: Annotated[str | None, typer.Option(help="YAML file for the true parameters.")] = None,
+    quiet: options.Quiet = False,
 ) -> None:
     """Simulate static readings of a sensor with known errors.
 
@@ -111,6 +112,10 @@ def command(
     if truth is not None:
         with whole_file(truth) as file:
             file.write(dump(record))
+    if not quiet:
+        for path in (output, truth):
+            if path not in (None, "-"):
+                typer.echo(f"accelcal: wrote {path}", err=True)
 
 
 def _check_raw(raw: bool, stated: list[str], samples: int, attitude: bool) -> None:

@@ -51,7 +51,7 @@ def command(
     old = load_result(result)
     _check_gravity(g, old, result)
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
-    options.warn_of_moves(readings)
+    options.warn_of_moves(readings, quiet)
     found = verify(old, readings, level, tolerance)
     _show(found, format)
     if not found.within and not quiet:

@@ -188,3 +188,8 @@ def test_the_help_says_what_each_command_does_in_a_whole_sentence(run):
     listed = run("--help").out.partition("Commands:\n")[2].splitlines()
     assert len(listed) == len(NAMES)
     assert all(line.endswith(".") and not line.endswith("...") for line in listed)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_command_can_be_quiet(run, name):
+    assert "-q, --quiet" in run(name, "--help").out
