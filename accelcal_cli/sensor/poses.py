@@ -49,7 +49,7 @@ def grid(most: int) -> Float:
 
 
 def faces_edges() -> Float:
-    """Return 6 faces and the 6 edges (e_i +- e_j)/sqrt 2, i < j, shape (12, 3): the default 12 positions."""
+    """Return 6 faces and the 6 edges (e_i +- e_j)/sqrt 2, i < j, shape (12, 3)."""
     return np.concatenate([faces(), edges()[[0, 1, 4, 5, 8, 9]]])
 
 
@@ -106,15 +106,15 @@ def directions(count: int, scheme: str | None, random: Float) -> Float:
 
     Args:
         count: number of poses J.
-        scheme: one of SCHEMES; when None: faces for 6, faces and edges for 12, the AKPSO turns for 24, an even
-            spread for any other number.
+        scheme: one of SCHEMES; when None: faces for 6, edges for 12, the AKPSO turns for 24, an even spread for
+            any other number.
         random: N(0, 1) numbers, shape (count, 3), used by the scheme "random" alone.
 
     Raises:
         UsageError: unknown scheme, or a scheme that does not have `count` poses.
     """
     if scheme is None:
-        scheme = {6: "faces", 12: "faces-edges", 24: "turns"}.get(count, "fibonacci")
+        scheme = {6: "faces", 12: "edges", 24: "turns"}.get(count, "fibonacci")
     if scheme not in SCHEMES:
         raise UsageError(
             f'--scheme "{scheme}": unknown{did_you_mean(scheme, SCHEMES)}; expected one of {", ".join(SCHEMES)}'

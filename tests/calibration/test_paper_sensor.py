@@ -16,7 +16,8 @@ from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge
 
 G = 9.8
-OUTPUT = DPSO.output(G * poses.faces_edges())
+TWELVE = poses.directions(12, None, np.zeros((0, 3)))
+OUTPUT = DPSO.output(G * TWELVE)
 PAPER = {"population": 100, "iterations": 500, "weight": 0.2, "crossover": 0.4}
 
 
@@ -36,7 +37,7 @@ def hybrid():
 
 def test_de_pso_reaches_rounding_in_every_run(hybrid):
     assert hybrid.cost.shape == (20,)
-    # Of 200 runs 199 end at or below 1e-22, one at 8e-20; these twenty are the first of seed 0.
+    # The worst of 1000 ends at 1e-25; with six faces and six edges two of 1000 stay above 1e-20.
     assert (hybrid.cost <= 1e-20).all(), hybrid.cost
     assert np.median(hybrid.cost) < 1e-26
 
@@ -74,7 +75,7 @@ def test_what_is_observable_is_found_and_the_rest_is_the_boxs(hybrid):
 
 def test_in_gauge_lower_every_parameter_is_right_to_nine_digits():
     run = _runs("de-pso", 20, unknowns=9, **PAPER)
-    assert (run.cost <= 1e-19).all(), run.cost
+    assert (run.cost <= 1e-20).all(), run.cost
     K, D = _problem(9).parameters(run.x)
     truth = to_gauge(DPSO.K, "lower")
     below = np.tril_indices(3)
@@ -84,12 +85,12 @@ def test_in_gauge_lower_every_parameter_is_right_to_nine_digits():
         assert (k[np.triu_indices(3, 1)] == 0).all()
 
 
-def test_twelve_edges_give_every_parameter_in_gauge_lower_for_every_seed():
-    """Of six faces and six edges about one run in 200 stalls; of the twelve edges none of 2000."""
-    data, truth, below = readings(poses.edges()), DPSO.in_gauge("lower"), np.tril_indices(3)
+def test_every_seed_of_a_calibration_arrives_in_gauge_lower_without_polish():
+    """In the default box, about a nominal that differs from seed to seed."""
+    data, truth, below = readings(TWELVE), DPSO.in_gauge("lower"), np.tril_indices(3)
     for seed in range(20):
         result = calibrate(data, Settings(g=G, seed=seed, parameters=PAPER, polish=False))
-        assert result.cost <= 1e-24
+        assert result.cost <= 1e-24, seed
         np.testing.assert_allclose(result.K_a[below], truth.K[below], rtol=1e-9)
         np.testing.assert_allclose(result.D_a, truth.D, rtol=1e-9)
 
@@ -105,7 +106,7 @@ def test_the_settings_of_the_paper_by_way_of_a_calibration():
         nominal=Nominal(scale=(5.67e5,) * 3),
         box=BoxSettings(scale=1e4 / 5.67e5, misalignment=1e3 / 5.67e5, bias=2e4 / (5.67e5 * G)),
     )
-    result = calibrate(readings(poses.faces_edges()), settings)
+    result = calibrate(readings(TWELVE), settings)
     assert result.cost <= 1e-20
     assert result.cost == result.cost_search
     assert result.evaluations == 100 * 501
@@ -123,7 +124,7 @@ def test_run_13_alone_is_run_13_of_twenty(hybrid):
 
 
 def test_a_seed_gives_a_record_of_the_same_bytes():
-    data = readings(poses.faces_edges(), sigma=1e-3)
+    data = readings(TWELVE, sigma=1e-3)
     texts = [json.dumps(calibrate(data, Settings(g=G, seed=seed)).record()) for seed in (4, 4, 5)]
     assert texts[0] == texts[1]
     assert texts[0] != texts[2]

@@ -89,7 +89,7 @@ def test_fibonacci_is_even(count):
 
 @pytest.mark.parametrize(
     ("count", "scheme"),
-    [(6, "faces"), (12, "faces-edges"), (24, "turns"), (7, "fibonacci"), (100, "fibonacci")],
+    [(6, "faces"), (12, "edges"), (24, "turns"), (7, "fibonacci"), (100, "fibonacci")],
 )
 def test_the_default_scheme_of_a_number(count, scheme):
     random = Streams(0, [0]).normal(count, 3)[0]
