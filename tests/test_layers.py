@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -43,6 +44,19 @@ def test_loading_the_library_loads_nothing_heavy():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT.parent)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"
+
+
+def test_a_calibration_loads_nothing_heavy():
+    """Nor does one whose repeated readings tell their scatter: loading scipy would take as long as all the rest."""
+    sample = Path(__file__).parents[1] / "docs" / "sample.csv"
+    script = (
+        "import sys\nfrom accelcal_cli.cli.main import app\n"
+        f"app(['calibrate', {str(sample)!r}, '--format', 'json', '-q'], standalone_mode=False)\n"
+        f"print([name for name in {layers.HEAVY!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT.parent)
+    assert 0 < json.loads(done.stdout)["noise_chance"] < 1
+    assert done.stderr.splitlines()[-1] == "[]"
 
 
 def _tree(folder, files):

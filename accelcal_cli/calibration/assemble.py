@@ -9,6 +9,7 @@ import numpy as np
 
 from accelcal_cli import __version__
 from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.chances import chi_square_chance
 from accelcal_cli.calibration.judgement import judge, notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
@@ -130,10 +131,9 @@ def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple
     variance = np.mean(np.sum((u * force) ** 2, axis=1) / readings.count)
     if not variance > 0:
         return None, None
-    from scipy.special import chdtrc
-
     ratio = s / float(np.sqrt(variance))
-    return ratio, float(chdtrc(freedom, freedom * ratio**2))
+    chance = chi_square_chance(np.array([freedom * ratio**2]), np.array([freedom]))
+    return ratio, float(chance[0])
 
 
 def _pose_fits(readings: Readings, fit: Fit, low: ErrorModel, sight: ErrorModel) -> tuple[PoseFit, ...]:
