@@ -29,8 +29,8 @@ def pose_weights(readings: FleetReadings, batch: Batch, settings: Settings) -> F
         return None if real.all() else real.astype(float)
     weights = np.ones(real.shape) if batch.behind is None else batch.behind
     if settings.weights == "sd":
-        square = None if batch.scatter is None else np.mean(batch.scatter**2, axis=2)
-        weights = np.full(real.shape, np.nan) if square is None else weights / square
+        square = np.zeros(real.shape) if batch.scatter is None else np.mean(batch.scatter**2, axis=2)
+        weights = np.divide(weights, square, out=np.full(real.shape, np.nan), where=square > 0)
     bad = (batch.behind is None) | ~(np.isfinite(weights) & (weights > 0)) & real
     if np.any(bad):
         at = int(np.argmax(np.broadcast_to(bad, real.shape).any(axis=1)))

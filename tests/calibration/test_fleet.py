@@ -204,6 +204,14 @@ def test_weights_that_a_sensor_lacks_are_refused_with_its_name(tmp_path):
         calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="n"))
 
 
+def test_a_standard_deviation_of_zero_is_no_weight(tmp_path):
+    rows = np.column_stack([rows_of(poses.turns(), 1), np.full((len(poses.turns()), 4), 2.0)])
+    rows[3, 4:] = 0.0
+    path = write(tmp_path / "a.csv", {"stuck": rows}, "sensor,ax,ay,az,n,sx,sy,sz")
+    with pytest.raises(DataError, match=r'sensor "stuck": --weights sd needs .* above zero'):
+        calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
+
+
 def test_the_least_cost_of_the_ellipsoid_is_where_the_gradient_vanishes():
     sets = np.stack([rows_of(poses.turns(), k, 0.05) for k in range(20)])
     triangle = compress_each(sets)
