@@ -65,11 +65,11 @@ def firm(dop: Float, verdict: Sequence[Verdict], s: Float, g: float) -> Bool:
         dop: dilution of precision, shape (R, 9); verdict: on the poses, R of them.
         s: standard deviation of one pose's modulus, m/s^2, shape (R,); g: local gravity, m/s^2.
     """
-    worst = dop.max(axis=1, keepdims=True)
-    bounded = np.isfinite(worst)
-    bend = (s[:, None] * np.where(bounded, worst, 0.0)) ** 2 / (2.0 * g)
+    bounded = np.isfinite(dop).all(axis=1, keepdims=True)
+    error = s[:, None] * np.where(bounded, dop, 0.0)
+    bend = error.max(axis=1, keepdims=True) ** 2 / (2.0 * g)
     poor = np.array([word == "undetermined" for word in verdict], dtype=bool)
-    return np.where(poor[:, None], bounded & (s[:, None] * dop >= bend), True)
+    return np.where(poor[:, None], bounded & (error >= bend), True)
 
 
 PRIOR = 1e-6

@@ -270,3 +270,16 @@ def test_sigma_of_a_real_fit_is_what_repeated_noise_gives():
 def test_the_papers_box_has_its_units():
     problem = loetters(DPSO.output(G * poses.turns()), G, dpso_box(9))
     assert problem.units[0].tolist() == [1e4] * 3 + [1e3] * 3 + [2e4] * 3
+
+
+def test_a_sigma_holds_where_it_is_more_than_the_bend_of_the_valley():
+    """An error of 0.1 x 30 m/s^2 along it bends by 3^2 / 20 = 0.45 m/s^2: firm from 4.5 times the noise on."""
+    dop = np.array([30.0, 4.6, 4.4, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    firm = quality.firm(np.array([dop, dop]), ["undetermined", "weak"], np.array([0.1, 0.1]), 10.0)
+    assert firm.tolist() == [[True, True] + [False] * 7, [True] * 9]
+
+
+def test_no_sigma_is_firm_beside_a_direction_without_bound():
+    dop = np.full((3, 9), 2.0)
+    dop[:, 3] = np.inf
+    assert not quality.firm(dop, ["undetermined"] * 3, np.array([0.0, 0.1, np.nan]), 9.8).any()
