@@ -11,11 +11,12 @@ from accelcal_cli.calibration.known import Linear, fit
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS
 from accelcal_cli.calibration.nominal import nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
-from accelcal_cli.calibration.quality import UNDETERMINED, WEAK
-from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL
+from accelcal_cli.calibration.quality import UNDETERMINED, WEAK, verdict_of
+from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL, room_of
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import pose_weights
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.verdict import final_verdict
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import AXES
@@ -152,9 +153,7 @@ def _nine(model: ErrorModel) -> Float:
 
 
 def _verdict(dop: Float, freedom: int) -> str:
-    if dop.max() > UNDETERMINED:
-        return "undetermined"
-    return "weak" if dop.max() > WEAK or freedom < 1 else "good"
+    return final_verdict(verdict_of(float(dop.max()), 9), edge=False, freedom=freedom)
 
 
 def _reasons(dop: Float, freedom: int) -> tuple[str, ...]:
@@ -172,8 +171,7 @@ def _reasons(dop: Float, freedom: int) -> tuple[str, ...]:
 
 def _square(found: Linear, w: Float) -> Float:
     """Return the squared residual of all three axes over what the fit leaves of it, (m/s^2)^2, shape (J,)."""
-    room = np.where(found.leverage < 1.0 - 1e-9, 1.0 - found.leverage, np.nan)
-    square: Float = w * np.einsum("ji,ji->j", found.error, found.error) / room
+    square: Float = w * np.einsum("ji,ji->j", found.error, found.error) / room_of(found.leverage)
     return square
 
 
@@ -191,7 +189,7 @@ def _outliers(found: Linear, w: Float) -> tuple[int, ...]:
 
 def _pose_fits(readings: Readings, found: Linear, w: Float, seen: Float) -> tuple[PoseFit, ...]:
     """Return the fit pose by pose; `seen` is |f| - |reference|, |f| - g before, and the direction, shape (J, 5)."""
-    room = np.where(found.leverage < 1.0 - 1e-9, 1.0 - found.leverage, np.nan)
+    room = room_of(found.leverage)
     with np.errstate(divide="ignore", invalid="ignore"):
         studentised = np.sqrt(w) * seen[:, 0] / (found.s * np.sqrt(room))
     kept = np.arange(len(w))
