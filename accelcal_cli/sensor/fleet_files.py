@@ -89,6 +89,9 @@ class _Gathering:
         first = self.store.rows
         column = sensor_column(table, sensor) if name is None else _own_column(table)
         columns = choose(table, wanted, column)
+        if column in columns.output:
+            shown = columns.names[columns.output.index(column)]
+            raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
         means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
         for rows in table.blocks(columns.selection()):
             if not len(rows.numbers):

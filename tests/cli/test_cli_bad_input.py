@@ -184,6 +184,10 @@ FLEET = {
         ["fleet.csv", "--sensor-column", "sensr"],
         ["--sensor-column", '"sensr"', 'did you mean "sensor"'],
     ),
+    "a reading as sensor column": (
+        ["fleet.csv", "--sensor-column", "Ny"],
+        ["--sensor-column", '"Ny"', "fleet.csv", "not a label"],
+    ),
     "two sensor columns": (["fleet-two.csv"], ['"device" or "serial"', "--sensor-column"]),
     "no header": (["fleet-bare.csv"], ["no header", "--sensor-column 1"]),
     "a sensor in every row": (["fleet-rows.csv"], ["fleet-rows.csv", "every row", "--sensor-column"]),
