@@ -6,7 +6,15 @@ import argparse
 import subprocess
 import sys
 
-BENCHMARKS = ("startup", "compression", "optimizers", "csv_speed", "detect_speed", "apply_speed")
+BENCHMARKS = (
+    "startup",
+    "compression",
+    "optimizers",
+    "csv_speed",
+    "detect_speed",
+    "apply_speed",
+    "fleet_speed",
+)
 
 
 def main() -> int:
