@@ -62,7 +62,8 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
             )
 
 
-def _style(number: int) -> dict[str, Any]:
+def line_style(number: int) -> dict[str, Any]:
+    """Return how matplotlib draws line `number`, from 0: a colour of its own, then a dash of its own."""
     dashes = DASHES[number // len(COLOURS) % len(DASHES)]
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes, "linewidth": 1.6}
 
@@ -70,7 +71,7 @@ def _style(number: int) -> dict[str, Any]:
 def _legend(labels: list[str]) -> list[Any]:
     from matplotlib.lines import Line2D
 
-    return [Line2D([], [], label=label, **_style(i)) for i, label in enumerate(labels)]
+    return [Line2D([], [], label=label, **line_style(i)) for i, label in enumerate(labels)]
 
 
 def _panel(
@@ -82,7 +83,7 @@ def _panel(
     floor = float(costs.min()) if costs.size else 1.0
     for label, (evaluations, cost) in panel.items():
         dot = "o" if np.ptp(evaluations) == 0 else ""  # a single evaluation has no line
-        style = _style(labels.index(label))
+        style = line_style(labels.index(label))
         axes.plot(evaluations, np.maximum(cost, floor / 10), marker=dot, markevery=[0], **style)
     if tolerance > 0:
         axes.axhline(tolerance, color="0.6", linewidth=0.8, zorder=0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from accelcal_cli.output.files import whole_file
-from accelcal_cli.output.plot import _style
+from accelcal_cli.output.plot import line_style
 from accelcal_cli.studies.navigation import Navigation
 from accelcal_cli.studies.navigation_tables import BOUND, INS, curves, own
 from accelcal_cli.studies.study import Record
@@ -89,7 +89,9 @@ def _draw_map(axes: Any, study: Navigation, records: Sequence[Record], labels: l
     )
     for cell, label in enumerate(labels):
         first = own(records, cell)[0]
-        axes.plot(axis_of(first, "longitude")[1], axis_of(first, "latitude")[1], label=label, **_style(cell))
+        axes.plot(
+            axis_of(first, "longitude")[1], axis_of(first, "latitude")[1], label=label, **line_style(cell)
+        )
     for name, values in zip("xy", track, strict=True):
         getattr(axes, f"set_{name}lim")(values.min() - 0.12, values.max() + 0.12)
     axes.set(title="Run 0 over the map", xlabel="longitude, deg", ylabel="latitude, deg")
@@ -105,7 +107,7 @@ def _draw_errors(panels: Any, study: Navigation, records: Sequence[Record]) -> N
         for cell, ((kind, _, _), rows) in enumerate(lines.items()):
             points = [(row["seconds"] / HOUR, row[key]) for row in rows if row[key] is not None]
             if points:
-                axes.plot(*zip(*points, strict=True), **LIMITS.get(kind, _style(cell)))
+                axes.plot(*zip(*points, strict=True), **LIMITS.get(kind, line_style(cell)))
             if kind == BOUND:
                 axes.annotate("bound", points[-1], fontsize=8, ha="right", va="top")
         axes.set(title=f"RMSE of {name}", xlabel="hour of the voyage", ylabel="m", yscale="log")
