@@ -68,7 +68,6 @@ class Streams:
     def take(self, index: Int) -> Streams:
         """Return the streams of the runs at `index`, going on where they stand."""
         chosen = Streams(self._seed, (self._runs[i] for i in index), self._purpose)
-        chosen._started = [
-            self.generators[i] for i in index
-        ]  # shared: what one draws the other does not draw again
+        # Shared: what one draws the other does not draw again.
+        chosen._started = [self.generators[i] for i in index]
         return chosen

@@ -21,7 +21,6 @@ SHIFT = 0.5
 """The box is moved off the closed form by up to this part of its half-width: the search finds the answer by
 itself, and the answer stays well inside."""
 
-
 SPHERE_PRIOR = 1e-3
 """Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what axes
 whose scale factors differ by 3 % pretend to say about an axis that the poses do not turn through."""
@@ -68,9 +67,8 @@ def search_box(triangle: Triangle, settings: Settings) -> Start:
     closed = np.zeros(sensors, dtype=bool)
     closed[index] = True
     sphere_K, sphere_D = _sphere(triangle, settings.g)
-    if (
-        unknowns == 12
-    ):  # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
+    if unknowns == 12:
+        # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
         K[index] = to_gauge(K[index], "symmetric")
     K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
     box = _box(K, D, settings, unknowns)

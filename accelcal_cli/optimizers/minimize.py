@@ -100,9 +100,8 @@ def minimize(
     """
     numbers = np.arange(runs) if isinstance(runs, int) else np.asarray(runs, dtype=np.int64)
     size = max(1, BLOCK_BYTES // (8 * optimizer.crowd * problem.dimensions))
-    np.empty(
-        1 << 20
-    )  # Freed at once: from now on glibc keeps smaller blocks instead of faulting them in anew.
+    # Freed at once: from now on glibc keeps smaller blocks instead of faulting them in anew.
+    np.empty(1 << 20)
     parts = []
     for first in range(0, len(numbers), size):
         block = np.arange(first, min(first + size, len(numbers)))
