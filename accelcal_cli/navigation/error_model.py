@@ -132,13 +132,6 @@ def metric(F: Float, before: Float, after: Float) -> Float:
     return changed
 
 
-def periods(A: Float) -> Float:
-    """Return the eigen-periods of one matrix A in s, longest first: Earth rate, and Schuler split by Foucault."""
-    rates = np.linalg.eigvals(A[:7, :7]).imag
-    oscillating = rates[rates > 1e-8]
-    return np.sort(2.0 * math.pi / oscillating)[::-1]
-
-
 @dataclass(frozen=True)
 class Grade:
     """How good an inertial navigation system is [depf2015] Table 1.

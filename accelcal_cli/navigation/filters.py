@@ -52,6 +52,9 @@ class Filter(ABC):
 
 FILTERS: Registry[Filter] = Registry("accelcal_cli.navigation", "filter")
 
+UNSEEN = -1e5
+"""Greatest log-likelihood of a cloud of which no particle is on the map: above OUTSIDE, below any misfit on it."""
+
 
 def log_likelihood(measured: Float, anomaly: Float, variance: float) -> Float:
     """Return -(y - map)^2 / 2R, OUTSIDE where the map has no value, and 0 without a measurement.

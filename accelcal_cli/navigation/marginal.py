@@ -24,7 +24,7 @@ import numpy as np
 from accelcal_cli.navigation.differential import metropolis
 from accelcal_cli.navigation.earth import metres_per_radian
 from accelcal_cli.navigation.error_model import STATES, process_noise
-from accelcal_cli.navigation.filters import Track, log_likelihood
+from accelcal_cli.navigation.filters import UNSEEN, Track, log_likelihood
 from accelcal_cli.navigation.resampling import moments, normalised, systematic
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.streams import Float, Streams
@@ -154,7 +154,7 @@ class Marginal:
             place = np.stack([north[:, w], east[:, w]], axis=1).swapaxes(1, 2)
             track.mean[:, k], spread = moments(weights, place)
             track.covariance[:, k] = spread + window.rest[:, w] @ window.rest[:, w].swapaxes(1, 2)
-            track.blind[:] += likelihoods[:, w].max(axis=1) < -1e5
+            track.blind[:] += likelihoods[:, w].max(axis=1) < UNSEEN
         return weights
 
     def _moved(

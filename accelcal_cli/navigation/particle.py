@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.navigation.error_model import STATES, process_noise
-from accelcal_cli.navigation.filters import Filter, Track, log_likelihood
+from accelcal_cli.navigation.filters import UNSEEN, Filter, Track, log_likelihood
 from accelcal_cli.navigation.resampling import SCHEMES, effective_size, moments, normalised
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import check, setting
@@ -22,9 +22,6 @@ from accelcal_cli.streams import Bool, Float, Streams
 Fitness = Callable[[Float], Float]
 CHUNK = 60
 """Epochs whose transition matrices are made together."""
-
-UNSEEN = -1e5
-"""Log-likelihood below which no particle is on the map."""
 
 GATE = 3.0
 """Evolved particles stay within so many sigma of the predicted cloud [chosen]."""
