@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.quality import PRIOR, Observability, design
+from accelcal_cli.calibration.quality import PRIOR, design
 from accelcal_cli.sensor.poses import corners, edges, faces, grid
 from accelcal_cli.streams import Float, Int, Streams
 
@@ -153,9 +153,3 @@ def _score(variances: Float, power: float) -> Float:
         score = score + np.log(((variances / largest[..., None]) ** power).sum(axis=-1)) / power
     total = SUM_WEIGHT * np.log(variances.sum(axis=-1))
     return np.asarray(np.round(np.round(score, DIGITS) + total, DIGITS))
-
-
-def dop_after(information: Float, directions: Float) -> Observability:
-    """Return the observability after taking the poses `directions`, shape (k, 3), too."""
-    rows = design(directions)
-    return Observability.of(information + rows.T @ rows, 9)

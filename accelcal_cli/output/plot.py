@@ -19,8 +19,6 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 """Okabe and Ito's colours, which the colour-blind tell apart; a second round is dashed, a third dotted."""
 
 DASHES = ("-", "--", ":")
-LETTERS, HANDLE = 13, 10
-"""Letters of a legend to an inch, and what line and gap of an entry take of them."""
 
 ACROSS = 3
 """Panels side by side at most."""

@@ -21,7 +21,6 @@ from accelcal_cli.calibration.planner import (
     best_poses,
     candidates,
     distinct_poses,
-    dop_after,
     fixture_directions,
     next_poses,
 )
@@ -34,6 +33,11 @@ from accelcal_cli.streams import Streams
 
 def _information(u):
     return design(u).T @ design(u)
+
+
+def dop_after(information, directions):
+    """Return the observability after taking the poses `directions`, shape (k, 3), too."""
+    return Observability.of(information + _information(directions), 9)
 
 
 def _worst_variance(information, direction):
