@@ -8,12 +8,12 @@ from dataclasses import asdict
 import numpy as np
 
 from accelcal_cli import __version__
-from accelcal_cli.calibration import quality
+from accelcal_cli.calibration import quality, sigma
 from accelcal_cli.calibration.chances import chi_square_chance
 from accelcal_cli.calibration.judgement import judge, notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
-from accelcal_cli.calibration.quality import Observability
+from accelcal_cli.calibration.quality import Observabilities
 from accelcal_cli.calibration.residuals import Fit, examine, outliers
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import loss_weight, robust_variance
@@ -43,17 +43,16 @@ def assemble(
     nine, point = lower_problem(solution.problem, found)
     low = ErrorModel(*(a[0] for a in nine.parameters(point)))
     information = quality.information(nine, point)[0] - (0.0 if slopes is None else slopes.loss)
-    seen = Observability.of(information, readings.poses)
+    known = Observabilities.of(information[None], np.array([readings.poses]))
+    seen = known.one(0)
     freedom = readings.poses - 9 - (0 if slopes is None else SLOPES)
     judged = judge(solution, start, information, low, readings.poses, freedom)
     centre = start.box.centre[0]
     before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
     fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
     variance = _variance(readings, settings, solution, low, weights, freedom)
-    # What stops at a wall of its box is not the least-squares answer.
-    firm = quality.firm(seen.dop[None], [seen.verdict], np.sqrt([variance]), g)[0] & (not judged.at_wall)
-    covariance = np.where(firm[:, None] & firm, variance * seen.cofactor, np.nan)
-    sigma_K, sigma_D = quality.propagate(shown.K, low.K, covariance, settings.gauge, g)
+    covariance = sigma.covariance(known, np.array([variance]), np.array([judged.at_wall]), g)[0]
+    sigma_K, sigma_D = sigma.propagate(shown.K, low.K, covariance, settings.gauge, g)
     scale_sigma = float(np.sqrt(np.diagonal(covariance)[quality.SCALE]).max()) / g
     ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
     return Calibration(

@@ -23,6 +23,7 @@ from accelcal_cli.calibration.quality import Observabilities
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.search import Solution, polish
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.sigma import covariance, propagate
 from accelcal_cli.calibration.verdict import at_edge, final_verdict
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimizers.minimize import Run, minimize
@@ -169,9 +170,6 @@ def _calibrated(
     freedom = batch.count - 9
     variance = np.where(freedom > 0, run.cost / (4.0 * g**2) / np.maximum(freedom, 1), np.nan)
     walled = np.any(at_edge(run.x), axis=1)
-    # What stops at a wall of its box is not the least-squares answer.
-    firm = quality.firm(seen.dop, seen.verdicts, np.sqrt(variance), g) & ~walled[:, None]
-    covariance = np.where(firm[:, :, None] & firm[:, None], variance[:, None, None] * seen.cofactor, np.nan)
     K = to_gauge(lower, settings.gauge)
     verdict = [
         final_verdict(word, bool(wall), int(left))
@@ -183,7 +181,7 @@ def _calibrated(
         batch.count,
         K,
         D,
-        *quality.propagate(K, lower, covariance, settings.gauge, g),
+        *propagate(K, lower, covariance(seen, variance, walled, g), settings.gauge, g),
         lower,
         seen.dop,
         run.cost,

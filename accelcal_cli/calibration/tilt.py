@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.calibration.quality import gauge_chain
 from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.sigma import gauge_chain
 from accelcal_cli.errors import UsageError
 from accelcal_cli.streams import Float
 

@@ -10,7 +10,8 @@ from simulated import DPSO, MEMS, dpso_box, loetters, rotation
 
 from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.lotters import Box, pack
-from accelcal_cli.calibration.quality import PARAMETERS, Observability, design, in_words, propagate
+from accelcal_cli.calibration.quality import PARAMETERS, Observability, design, in_words
+from accelcal_cli.calibration.sigma import firm, propagate
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
@@ -275,11 +276,11 @@ def test_the_papers_box_has_its_units():
 def test_a_sigma_holds_where_it_is_more_than_the_bend_of_the_valley():
     """An error of 0.1 x 30 m/s^2 along it bends by 3^2 / 20 = 0.45 m/s^2: firm from 4.5 times the noise on."""
     dop = np.array([30.0, 4.6, 4.4, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-    firm = quality.firm(np.array([dop, dop]), ["undetermined", "weak"], np.array([0.1, 0.1]), 10.0)
-    assert firm.tolist() == [[True, True] + [False] * 7, [True] * 9]
+    held = firm(np.array([dop, dop]), ["undetermined", "weak"], np.array([0.1, 0.1]), 10.0)
+    assert held.tolist() == [[True, True] + [False] * 7, [True] * 9]
 
 
 def test_no_sigma_is_firm_beside_a_direction_without_bound():
     dop = np.full((3, 9), 2.0)
     dop[:, 3] = np.inf
-    assert not quality.firm(dop, ["undetermined"] * 3, np.array([0.0, 0.1, np.nan]), 9.8).any()
+    assert not firm(dop, ["undetermined"] * 3, np.array([0.0, 0.1, np.nan]), 9.8).any()

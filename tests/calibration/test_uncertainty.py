@@ -10,6 +10,7 @@ from simulated import DPSO
 from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.compress import compress_each
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
+from accelcal_cli.calibration.sigma import propagate
 from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimizers.minimize import Status, minimize
 from accelcal_cli.sensor import poses
@@ -75,7 +76,7 @@ def test_intervals_of_the_printed_parameters_cover_the_truth(fits):
     """K_a and D_a in gauge lower with the propagated sigma, which is what a user reads."""
     quantile, covered, below = t.ppf(0.975, fits.freedom), [], np.tril_indices(3)
     for K, D, s2, cofactor in zip(fits.K, fits.D, fits.s2, fits.cofactor, strict=True):
-        sigma_K, sigma_D = quality.propagate(K, K, s2 * cofactor, "lower", G)
+        sigma_K, sigma_D = propagate(K, K, s2 * cofactor, "lower", G)
         covered.append(
             np.concatenate(
                 [
