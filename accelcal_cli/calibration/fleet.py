@@ -12,14 +12,13 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.assemble import assemble
 from accelcal_cli.calibration.compress import compress_each
 from accelcal_cli.calibration.ellipsoid import least_squares
 from accelcal_cli.calibration.fleet_fit import pose_weights, reasons, residuals
 from accelcal_cli.calibration.lotters import Loetters
 from accelcal_cli.calibration.nominal import Start, search_box
-from accelcal_cli.calibration.quality import Observabilities
+from accelcal_cli.calibration.quality import Observabilities, information
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.search import Solution, polish
 from accelcal_cli.calibration.settings import Settings
@@ -165,8 +164,7 @@ def _calibrated(
     problem = Loetters(triangle, g, start.box)
     run = _solve(problem, start, settings)
     lower, D = problem.parameters(run.x)
-    information = quality.information(problem, run.x)
-    seen = Observabilities.of(information, batch.count)
+    seen = Observabilities.of(information(problem, run.x), batch.count)
     freedom = batch.count - 9
     variance = np.where(freedom > 0, run.cost / (4.0 * g**2) / np.maximum(freedom, 1), np.nan)
     walled = np.any(at_edge(run.x), axis=1)
@@ -175,33 +173,30 @@ def _calibrated(
         final_verdict(word, bool(wall), int(left))
         for word, wall, left in zip(seen.verdicts, walled, freedom, strict=True)
     ]
+    sigma_k, sigma_d = propagate(K, lower, covariance(seen, variance, walled, g), settings.gauge, g)
     rms, rms_before, outlying = residuals(readings, batch, lower, D, start, seen, weights, settings)
-    part = Fleet(
-        batch.sensors,
-        batch.count,
-        K,
-        D,
-        *propagate(K, lower, covariance(seen, variance, walled, g), settings.gauge, g),
-        lower,
-        seen.dop,
-        run.cost,
-        np.sqrt(variance),
-        rms,
-        rms_before,
-        np.array(verdict, dtype=object),
-        reasons(problem, start, run, seen, batch, verdict),
-        outlying,
-    )
     if keep is not None:
-        for at in range(len(batch.sensors)):
+        for at, number in enumerate(batch.sensors.tolist()):
             own = None if weights is None else weights[at, : batch.count[at]]
-            solution = _solution(problem, run, at)
-            index = np.array([at])
-            keep(
-                int(batch.sensors[at]),
-                assemble(readings.one(batch, at), settings, start.take(index), solution, own),
-            )
-    return part
+            box, solution = start.take(np.array([at])), _solution(problem, run, at)
+            keep(number, assemble(readings.one(batch, at), settings, box, solution, own))
+    return Fleet(
+        number=batch.sensors,
+        poses=batch.count,
+        K_a=K,
+        D_a=D,
+        sigma_k=sigma_k,
+        sigma_d=sigma_d,
+        lower=lower,
+        dop=seen.dop,
+        cost=run.cost,
+        s=np.sqrt(variance),
+        rms=rms,
+        rms_before=rms_before,
+        verdict=np.array(verdict, dtype=object),
+        reason=reasons(problem, start, run, seen, batch, verdict),
+        outlying=outlying,
+    )
 
 
 def _solve(problem: Loetters, start: Start, settings: Settings) -> Run:
