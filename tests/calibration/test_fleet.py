@@ -289,6 +289,20 @@ def test_sensors_that_stand_out_are_named_and_no_others(odd):
     assert by["S33"].middle == pytest.approx(0.01, rel=0.2)
 
 
+def test_a_sensor_of_few_poses_may_be_farther_off(tmp_path):
+    """Equal sensors; the one whose ten poses tell less is as far off as its sigma allows, and is not named."""
+    cap = poses.fibonacci(60)[:20]
+    named = 0
+    for trial in range(3):
+        sets = {f"S{k}": (poses.turns() if k else cap, 100 * trial + k) for k in range(30)}
+        tables = {k: MEMS.output(G * u + noise(len(u), 0.01, seed)) for k, (u, seed) in sets.items()}
+        fleet = calibrate_fleet(read_fleet([write(tmp_path / "a.csv", tables)]), LM)
+        assert fleet.determined.all()
+        assert fleet.dop[0].max() > 4 * fleet.dop[1].max()
+        named += len(standouts(fleet, G))
+    assert named == 0
+
+
 def test_a_few_sensors_are_no_fleet_to_stand_out_from(tmp_path):
     tables = {f"S{k}": rows_of(poses.turns(), k) for k in range(9)}
     tables["S3"] *= 2.0
