@@ -41,6 +41,7 @@ SCHEMES = {
     "two": poses.faces()[:2],
     "one": poses.faces()[:1],
     "equal": np.repeat(poses.faces()[:1], 12, axis=0),
+    "wide cap": poses.fibonacci(120)[:20],
 }
 """Good, weak, undetermined and useless sets of poses, of many lengths."""
 
@@ -100,7 +101,7 @@ def test_every_sensor_is_calibrated_as_if_it_were_alone(mixed, tmp_path, setting
     readings = read_fleet([path])
     fleet = calibrate_fleet(readings, settings)
     assert readings.sensors == tuple(dict.fromkeys(line.split(",")[0] for line in lines_of(path)[1:]))
-    seen = set()
+    seen, told = set(), 0
     for r, label in enumerate(readings.sensors):
         seen.add(fleet.verdict[r])
         alone = tmp_path / "alone.csv"
@@ -119,6 +120,9 @@ def test_every_sensor_is_calibrated_as_if_it_were_alone(mixed, tmp_path, setting
         dop = np.array(list(one.dop.parameters.values()))
         if one.verdict == "undetermined":
             np.testing.assert_array_equal(np.isinf(fleet.dop[r]), np.isinf(dop))
+            np.testing.assert_array_equal(np.isnan(fleet.sigma_k[r]), np.isnan(one.sigma.K_a))
+            np.testing.assert_array_equal(np.isnan(fleet.sigma_d[r]), np.isnan(one.sigma.D_a))
+            told += np.isfinite(fleet.sigma_d[r]).all()  # of an open direction whose noise is small
             continue
         scale = one.K_a[0, 0]
         np.testing.assert_allclose(fleet.K_a[r], one.K_a, rtol=1e-9, atol=1e-9 * scale)
@@ -132,6 +136,7 @@ def test_every_sensor_is_calibrated_as_if_it_were_alone(mixed, tmp_path, setting
         named = [p.where for p in one.poses_fit if p.pose in one.outliers]
         assert bool(fleet.outlying[r]) == bool(named)
     assert {"undetermined", FAILED} <= seen
+    assert told == (settings.nominal is None)
     assert ("good" in seen) == (settings.nominal is None)
 
 
@@ -338,7 +343,7 @@ def test_the_summary_tells_what_is_wrong(mixed):
     assert first[1] == FAILED
     assert "only one pose" in first[2] or "equal" in first[2]
     assert "and" in tables["Not good"].notes[0].lower()
-    assert counts(fleet).startswith("26 sensors: ")
+    assert counts(fleet).startswith("28 sensors: ")
     worst = [row[1] for row in tables["Worst fit"].rows]
     assert worst == sorted(worst, reverse=True)
     assert worst[0] == np.nanmax(np.where(fleet.determined, fleet.rms, np.nan))
