@@ -63,6 +63,7 @@ class _Lines:
         self.line = 0
         self.glue = dialect.separator.encode()
         self.titled = dialect.names is None or dialect.header_line > 0
+        self.quoted = dialect.decimal_comma and dialect.separator == ","
 
     def write(self, block: bytes, values: Float, file: IO[bytes]) -> None:
         """Write the changed block: by polars where every line is a plain row, else line by line."""
@@ -72,7 +73,7 @@ class _Lines:
 
     def _plain(self, block: bytes, rows: int, end: bytes) -> bool:
         """Whether to try polars: past the header, one kind of line ends, no blank line that it would drop."""
-        if len(block) < SMALL or not self.titled or self.line < self.dialect.header_line:
+        if len(block) < SMALL or self.quoted or not self.titled or self.line < self.dialect.header_line:
             return False
         if not block.endswith(end) or has_outer_blank_line(block):
             return False
@@ -146,7 +147,8 @@ class _Lines:
 
     def _number(self, value: float) -> bytes:
         text = repr(value) if value == value else "NaN"  # as polars writes it
-        return (text.replace(".", ",") if self.dialect.decimal_comma else text).encode()
+        text = text.replace(".", ",") if self.dialect.decimal_comma else text
+        return (f'"{text}"' if self.quoted else text).encode()
 
     def _comment(self, line: bytes) -> bytes:
         """Return a comment line; one that names the columns names the new ones, too."""

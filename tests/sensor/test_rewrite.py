@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 
 import numpy as np
@@ -148,6 +149,16 @@ def test_fractions_with_a_comma(small, replace, monkeypatch):
     assert cells[0] == "4,5"
     assert [float(c.replace(",", ".")) for c in cells[-3:]] == [0.5, 4.25 / 3, 9.8 / 3]
     assert "." not in out[5]
+
+
+@pytest.mark.parametrize("small", [True, False], ids=["careful", "polars"])
+@pytest.mark.parametrize("replace", [True, False])
+def test_fractions_with_a_comma_between_commas_are_quoted(small, replace, monkeypatch):
+    text = "t,ax,ay,az\n" + "".join(f'"{k},5","1,5","{k},25","9,8"\n' for k in range(40))
+    out = run(text.encode(), replace=replace, small=small, monkeypatch=monkeypatch).decode()
+    rows = list(csv.reader(io.StringIO(out)))
+    assert {len(row) for row in rows} == {4 if replace else 7}
+    assert [float(c.replace(",", ".")) for c in rows[5][-3:]] == [0.5, 4.25 / 3, 9.8 / 3]
 
 
 @pytest.mark.parametrize("small", [True, False], ids=["careful", "polars"])
