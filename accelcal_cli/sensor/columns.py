@@ -163,6 +163,7 @@ def _only_numeric(table: Table, names: Sequence[str], roles: Roles, sensor: int 
     if len(left) > 3:
         left = [k for k in left if table.numeric[k]]
     if len(left) == 3:
+        _refuse_namesakes(table, [names[k] for k in left if names[k]])
         return left[0], left[1], left[2]
     if len(names) < 3:
         raise DataError(f"{table.name}: has {_plural(len(names))} where three (x, y, z) were expected")
@@ -170,6 +171,15 @@ def _only_numeric(table: Table, names: Sequence[str], roles: Roles, sensor: int 
         f"{table.name}: no column names such as ax, ay, az; say which columns are x, y, z with --columns "
         f"(there are {_listed(names, range(len(names)))})"
     )
+
+
+def _refuse_namesakes(table: Table, names: Sequence[str]) -> None:
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise DataError(
+                f'{table.name}: two columns are called "{name}"; say which are x, y, z with --columns and column '
+                "numbers"
+            )
 
 
 def _with_extras(

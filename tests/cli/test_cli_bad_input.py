@@ -22,6 +22,7 @@ FILES = {
     "wide.csv": "1,2,3,4\n4,5,6,7\n",
     "equal.csv": "Nx,Ny,Nz\n" + "1,2,3\n" * 20,
     "one.csv": "Nx,Ny,Nz\n1,2,3\n",
+    "namesakes.csv": "Nx,Ny,Nx\n1,2,3\n4,5,6\n",
     "latin.csv": b"Nx,Ny,Nz\n1,2,3\n\xe9,5,6\n",
     "zeros.csv": b"\0" * 5000,
     "packed.csv": b"\x1f\x8b\x08\0\0\0\0\0",
@@ -100,6 +101,7 @@ CALIBRATE = {
     "nan latitude": (["good.csv", "--latitude", "nan"], ["--latitude nan", "-90 to 90"]),
     "height alone": (["good.csv", "--height", "100"], ["--height", "--latitude"]),
     "height": (["good.csv", "--latitude", "5", "--height", "1e9"], ["--height", "expected metres"]),
+    "two columns of one name": (["namesakes.csv"], ["namesakes.csv", "two columns", '"Nx"', "--columns"]),
     "population": (["good.csv", "--population", "1"], ["population: 1", "at least 8"]),
     "iterations": (["good.csv", "--iterations", "0"], ["iterations: 0", "at least 1"]),
     "runs": (["good.csv", "--runs", "0"], ["runs: 0", "at least 1"]),
@@ -267,6 +269,23 @@ def test_fleet_refuses(run, folder, what):
     arguments, parts = FLEET[what]
     before = sorted(os.listdir(folder))
     refused(run("fleet", *arguments), parts)
+    assert sorted(os.listdir(folder)) == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("apply", "good.csv", "result.yaml"),
+        ("verify", "good.csv", "result.yaml"),
+        ("export", "good.csv", "--to", "px4"),
+        ("report", "good.csv", "-o", "page.html"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_readings_are_no_result_file(run, folder, arguments):
+    Path("result.yaml").write_text("")
+    before = sorted(os.listdir(folder))
+    refused(run(*arguments), ["good.csv", "result file of a calibration was expected"])
     assert sorted(os.listdir(folder)) == before
 
 
