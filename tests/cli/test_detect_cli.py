@@ -77,6 +77,15 @@ def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
     assert run("plan", "poses.csv").err == ""
 
 
+def test_a_raw_log_without_names_is_told_too_and_many_poses_are_not(run, log):
+    bare = "".join(line.partition(",")[2] for line in Path(log).read_text().splitlines(keepends=True)[1:])
+    said = "each row is taken for a pose at rest; if these"
+    Path("bare.csv").write_text(bare)
+    assert run("plan", "bare.csv", "--columns", "1,2,3").err.startswith(f"accelcal: bare.csv: {said}")
+    run("simulate", "--sensor", "mems", "--positions", "600", "-o", "poses.csv")
+    assert run("plan", "poses.csv").err == ""
+
+
 def test_weights_of_a_raw_log_can_be_stated(run, log):
     Path("plain.yaml").write_text("weights: none\n")
     for arguments in (["--weights", "none"], ["--config", "plain.yaml"]):
