@@ -10,7 +10,7 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration import quality, sigma
 from accelcal_cli.calibration.chances import chi_square_chance
-from accelcal_cli.calibration.judgement import judge, notes
+from accelcal_cli.calibration.judgement import judge, more_than_noise, notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.quality import Observabilities
@@ -90,7 +90,11 @@ def assemble(
         settings=_settings_record(settings, start),
         g=g,
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
-        notes=(*readings.notes, *notes(solution, start, settings, np.sqrt(variance), scale_sigma)),
+        notes=(
+            *readings.notes,
+            *notes(solution, start, settings, np.sqrt(variance), scale_sigma),
+            *more_than_noise(ratio, chance),
+        ),
         version=__version__,
         temperature=None if slopes is None else slopes.temperature,
     )

@@ -26,6 +26,10 @@ NOISE_BIAS = 3.0
 on average, and the noise in the products of outputs doubles it. Measured at s/g from 0.02 to 0.1."""
 
 
+MORE_THAN_NOISE, SURELY = 2.0, 1e-3
+"""Residuals this many times their noise, and by chance this rarely, are told of."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """What is said of a solution.
@@ -92,6 +96,20 @@ def _suggest(information: Float, seen: Observability, poses: int) -> tuple[str, 
     candidates = fixture_directions()
     chosen = next_poses(information, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
     return tuple(describe(candidates[i]) for i in chosen)
+
+
+def more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
+    """Return a warning of residuals that the scatter within poses does not explain.
+
+    Args:
+        ratio: s over what the scatter predicts; chance: that of so large a ratio. None where nothing tells them.
+    """
+    if ratio is None or chance is None or ratio < MORE_THAN_NOISE or chance > SURELY:
+        return ()
+    return (
+        f"The residuals are {ratio:.2g} times what the scatter within the poses explains: the sensor moved in them, "
+        "changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the poses alone.",
+    )
 
 
 def notes(
