@@ -26,6 +26,10 @@ from accelcal_cli.sensor.readings import Readings
 SCHEMA = "accelcal/verification/1"
 
 
+STRANGE = 0.5
+"""Readings off by this part of g are rather in another unit than of a sensor that changed."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """One of the nine parameters, new minus old, m/s^2 at 1 g; NaN where the new readings do not determine it.
@@ -120,9 +124,10 @@ def verify(
     tests = Tests.of(old, found)
     verdict = "changed" if tests.chance < level else "unchanged"
     differences = _differences(found, tests, level if verdict == "changed" else 0.0)
+    rms = _rms(old, readings)
     return Verification(
         verdict=verdict,
-        reasons=(*_reasons(verdict, differences, found, tests.pair, level), *warmth),
+        reasons=(*_strange(rms, old), *_reasons(verdict, differences, found, tests.pair, level), *warmth),
         chance=tests.chance,
         level=level,
         chi_square=tests.chi_square,
@@ -132,7 +137,7 @@ def verify(
         s_old=old.s,
         s_new=float(np.sqrt(found.noise.variance)) if found.noise.freedom else float("nan"),
         noise_chance=tests.pair.noise_chance(),
-        rms=_rms(old, readings),
+        rms=rms,
         tolerance=tolerance,
         poses=readings.poses,
         freedom=found.noise.freedom,
@@ -148,6 +153,15 @@ def _rms(old: Calibration, readings: Readings) -> float:
     model = old.model.in_gauge("lower")
     squares = sum(square_error(e, old.g) for _, e, _ in modulus_errors(readings, model, old.g))
     return float(np.sqrt(squares / readings.poses))
+
+
+def _strange(rms: float, old: Calibration) -> tuple[str, ...]:
+    """Return a warning of readings that no ageing explains."""
+    if rms < STRANGE * old.g:
+        return ()
+    return (
+        f"Under the result they miss g by {rms:.3g} {old.unit}: another unit than its readings, or another sensor?",
+    )
 
 
 def _check(old: Calibration) -> None:

@@ -55,6 +55,17 @@ def test_the_same_sensor_passes(run, result, other):
     assert "bias z" in outcome.out
 
 
+def test_readings_in_another_unit_are_told(run, result, other):
+    assert "another unit" not in run("verify", result, other).out
+    rows = [line.split(",") for line in Path(other).read_text().splitlines()]
+    parts = [",".join(repr(float(cell) / 16384) for cell in row) for row in rows[1:]]
+    Path("g.csv").write_text("\n".join([",".join(rows[0]), *parts]))
+    outcome = run("verify", result, "g.csv")
+    assert outcome.code == 1
+    assert "Under the result they miss g by 9." in outcome.out
+    assert "another unit than its readings" in outcome.out
+
+
 def test_another_sensor_fails(run, result, other, tmp_path):
     rows = [line.split(",") for line in Path(other).read_text().splitlines()]
     moved = [",".join([x, y, repr(float(z) + 40)]) for x, y, z in rows[1:]]
