@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import yaml
 
@@ -51,7 +51,11 @@ def load_mapping(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: unreadable, not UTF-8, not YAML (line and column named), a key twice, or not a mapping.
     """
-    text = _text(path)
+    return _mapping(_text(path), str(path))
+
+
+def _mapping(text: str, path: str) -> dict[str, Any]:
+    """Return the mapping in YAML text of a file."""
     try:
         content = yaml.load(text, Loader=_UniqueKeys)
     except yaml.MarkedYAMLError as error:
@@ -65,9 +69,9 @@ def load_mapping(path: Path) -> dict[str, Any]:
     return dict(content)
 
 
-def _text(path: Path) -> str:
+def _text(path: Path, stdin: BinaryIO | None = None) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return (path.read_bytes() if stdin is None else stdin.read()).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -75,20 +79,24 @@ def _text(path: Path) -> str:
         raise ConfigError(f"{path}: {reason.lower()}") from None
 
 
-def load_result(path: str | Path) -> Calibration:
-    """Return the calibration of a result file, JSON or YAML whatever its name says.
+def load_result(path: str | Path, stdin: BinaryIO | None = None) -> Calibration:
+    """Return the calibration of a result file, JSON or YAML whatever its name says; of `stdin` where it is given.
 
     Raises:
         ConfigError: unreadable, or neither JSON nor YAML.
         DataError: not the record of a calibration; the message names the key.
     """
-    file = Path(path)
-    text = _text(file)
+    text = _text(Path(path), stdin)
     record = None
     if text.lstrip().startswith("{"):  # YAML 1.1 would take JSON's 1e-05 for text
         with contextlib.suppress(ValueError):  # flow style YAML, or a fault that the YAML parser can place
             record = json.loads(text)
-    return Calibration.from_record(load_mapping(file) if record is None else record, str(path))
+    if record is None:
+        try:
+            record = _mapping(text, str(path))
+        except ConfigError as error:
+            raise ConfigError(f"{error}; the result file of a calibration was expected") from None
+    return Calibration.from_record(record, str(path))
 
 
 def dump(record: Mapping[str, Any]) -> str:

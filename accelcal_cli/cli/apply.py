@@ -15,7 +15,7 @@ PARQUET = (".parquet", ".pq")
 
 
 def command(
-    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
     data: Annotated[str, typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.")],
     output: Annotated[
         str, typer.Option("--output", "-o", help="Log to write, .parquet for Parquet; - is standard output.")
@@ -50,14 +50,13 @@ def command(
     text. The log streams through: memory does not grow with it.
     """
     from accelcal_cli.calibration.apply import Wish, prepare
-    from accelcal_cli.config import load_result
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.sensor.tabular import open_table
 
     options.check_input(data)
     check_target(output)
     wish = Wish(unit, replace, prefix, tilt, noise)
-    calibration = load_result(result)
+    calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)
     table = open_table(data, sys.stdin.buffer, hashed=False)
     try:

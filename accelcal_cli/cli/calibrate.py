@@ -141,7 +141,7 @@ def command(
     if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
         typer.echo(
             f"accelcal: g = {settings.g} assumed; state yours with --g or --latitude and --height "
-            "(scale factors are proportional to it)",
+            f"(scale factors are proportional to it){_units_of_g(result)}",
             err=True,
         )
     if tolerance is not None and not result.rms <= tolerance:
@@ -149,6 +149,12 @@ def command(
         raise typer.Exit(BAD_VERDICT)
     if result.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
+
+
+def _units_of_g(result: Calibration) -> str:
+    """Return what to say of readings that are 1 long and not 9.8: they were compared with m/s^2."""
+    looks = 0.8 < float(result.nominal_scale.mean()) * result.g < 1.25
+    return "; readings in units of g, as these seem to be, go with --g 1" if looks else ""
 
 
 def _check_output(output: str | None, format: str) -> None:
@@ -173,8 +179,9 @@ def _show(result: Calibration, format: str, output: str | None, quiet: bool) -> 
         from accelcal_cli.config import dump
         from accelcal_cli.output.files import whole_file
 
-        with whole_file(output) as file:
-            file.write(json_text(result.record()) if output.endswith(".json") else dump(result.record()))
+        text = json_text(result.record()) if output.endswith(".json") else dump(result.record())
+        with whole_file(output, binary=True) as file:  # read back as UTF-8, whatever the terminal takes
+            file.write(text.encode())
         if output == "-":
             return
     if format == "json":

@@ -15,7 +15,7 @@ NAMES = "px4, ardupilot, kalibr, imucal, ros, c-header or numpy"
 
 
 def command(
-    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
     to: Annotated[str, typer.Option(help=f"Format: {NAMES}.", metavar="FORMAT")],
     output: Annotated[str, typer.Option("--output", "-o", help="File to write; - is standard output.")] = "-",
     instance: Annotated[int, typer.Option(help="Number of the accelerometer in the target.", min=0)] = 0,
@@ -36,7 +36,6 @@ def command(
     """
     from accelcal_cli.calibration.exporters.base import Target
     from accelcal_cli.calibration.exporters.formats import check_name, export
-    from accelcal_cli.config import load_result
     from accelcal_cli.output.files import check_target, whole_file
 
     check_name(to)
@@ -45,7 +44,7 @@ def command(
     check_target(output)
     if to == "numpy" and output == "-" and sys.stdout.isatty():
         raise UsageError("--to numpy is no text for a terminal; name a file with -o")
-    calibration = load_result(result)
+    calibration = options.load_result(result)
     calibration.check_determined(result, force=force)
     made = export(calibration, to, Target(instance, driver_scale))
     with whole_file(output, binary=True) as file:

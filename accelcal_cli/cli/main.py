@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -158,11 +159,13 @@ def _explain(error: Any) -> NoReturn:
 
 
 def _open_streams() -> None:
-    """Put the null device where a stream was closed, as by `<&-`: Python has None there."""
+    """Put the null device where a stream was closed, as by `<&-`: Python has None there. Print any text."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, open(null, mode, closefd=False))  # noqa: SIM115  # open as long as the program
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a label that the terminal's encoding lacks is no failure
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _fail(message: str, code: int) -> NoReturn:

@@ -11,6 +11,7 @@ import typer
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.sensor.readings import Readings
 
 FORMATS = ("table", "json", "csv")
@@ -49,6 +50,25 @@ def check_input(source: str) -> None:
     """Raise UsageError when readings are to come from a terminal, where nobody types them."""
     if source == "-" and sys.stdin.isatty():
         raise UsageError("-: standard input is a terminal; expected the name of a file, or a pipe")
+
+
+def load_result(source: str, data: str | None = None) -> Calibration:
+    """Return the calibration of a result file, or of standard input for `-`.
+
+    Raises:
+        UsageError: standard input is a terminal, or `data` is to come from it, too.
+        ConfigError, DataError: no result file.
+    """
+    from accelcal_cli import config
+
+    if source != "-":
+        return config.load_result(source)
+    if data == "-":
+        raise UsageError(
+            "- -: standard input is one file; expected the name of the result file or of the readings"
+        )
+    check_input(source)
+    return config.load_result("<stdin>", sys.stdin.buffer)
 
 
 def gravity(g: float | None, latitude: float | None, height: float | None) -> float | None:

@@ -143,5 +143,7 @@ def _show(found: Plan, format: str) -> None:
 
         out = console.console()
         console.show_split(pose_table(found), out)
-        console.show([parameter_table(found)], out)
+        expected = parameter_table(found)
+        if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
+            console.show([expected], out)
     sys.stdout.flush()

@@ -15,7 +15,7 @@ BAD_VERDICT = 1
 
 
 def command(
-    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
     output: Annotated[str, typer.Option("--output", "-o", help="HTML file; - is standard output.")],
     title: Annotated[
         str | None, typer.Option(help="Heading of the page.", show_default="calibration of the readings")
@@ -28,7 +28,6 @@ def command(
     links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the verdict is
     "undetermined"; the report is written all the same.
     """
-    from accelcal_cli.config import load_result
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.output.report import check_packages, page
 
@@ -36,11 +35,13 @@ def command(
         raise UsageError(f'-o "{output}": expected a name that ends in {" or ".join(SUFFIXES)}')
     check_target(output)
     check_packages()
-    found = load_result(result)
+    found = options.load_result(result)
     source = Path(str(found.data.get("source", result))).name
     text = page(found, title or f"Calibration of {source}")
-    with whole_file(output) as file:
-        file.write(text)
+    with whole_file(
+        output, binary=True
+    ) as file:  # the page says that it is UTF-8, whatever the terminal takes
+        file.write(text.encode())
     if not quiet and output != "-":
         typer.echo(f"accelcal: wrote {output}", err=True)
     if found.verdict == "undetermined":

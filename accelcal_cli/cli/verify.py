@@ -19,7 +19,7 @@ FAILED = 1
 
 
 def command(
-    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate.")],
+    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
     data: Annotated[str, typer.Argument(help="New static readings of the sensor; - is standard input.")],
     columns: options.Columns = None,
     g: Annotated[
@@ -40,7 +40,6 @@ def command(
     of |f| - g against a tolerance. Exit code 1 means that the sensor has changed or that --tolerance was missed.
     """
     from accelcal_cli.calibration.verify import verify
-    from accelcal_cli.config import load_result
     from accelcal_cli.sensor.readings import read_readings
 
     options.check_format(format)
@@ -48,7 +47,7 @@ def command(
     options.check_tolerance(tolerance)
     if not 0 < level < 1:
         raise UsageError(f"--level {level:g}: expected a chance between 0 and 1")
-    old = load_result(result)
+    old = options.load_result(result, data)
     _check_gravity(g, old, result)
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     options.warn_of_moves(readings, quiet)

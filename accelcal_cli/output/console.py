@@ -37,7 +37,10 @@ class _Console(Console):
 def console(file: IO[str] | None = None) -> Console:
     """Return a console for `file` (standard output when None); NO_COLOR and COLUMNS are respected."""
     target = file or sys.stdout
-    width = None if target.isatty() or "COLUMNS" in os.environ else PIPE_WIDTH
+    stated = os.environ.get("COLUMNS", "")
+    width = (
+        None if target.isatty() or stated.strip("0") else PIPE_WIDTH
+    )  # of 0 columns rich would print nothing
     return _Console(file=target, width=width, highlight=False, emoji=False, markup=False)
 
 
@@ -63,6 +66,8 @@ def show_split(table: Table, out: Console) -> None:
 def _parts(table: Table, width: int) -> list[Table]:
     """Return the parts of a table that fit into a width; none when there is a column too wide for it."""
     others = len(table.columns) - 1
+    if not others:
+        return [table]
     ends = [i for i in range(1, others + 1) if i == others or not table.columns[i + 1].beside]
     parts: list[Table] = []
     start = 0

@@ -236,3 +236,13 @@ def test_a_robust_loss_stands_a_bad_pose(run, good, tmp_path, loss):
     plain = np.abs(record(run, "bad.csv")["K_a"] - clean).max()
     robust = np.abs(record(run, "bad.csv", "--robust", loss)["K_a"] - clean).max()
     assert robust < 0.5 * plain
+
+
+def test_readings_in_g_that_are_compared_with_metres_are_told(run, good):
+    rows = [line.split(",") for line in Path(good).read_text().splitlines()]
+    parts = [",".join(repr(float(cell) / 16384) for cell in row) for row in rows[1:]]
+    Path("g.csv").write_text("\n".join([",".join(rows[0]), *parts]))
+    fast = ("--optimizer", "ellipsoid")
+    assert "go with --g 1" in run("calibrate", "g.csv", *fast).err
+    assert run("calibrate", "g.csv", "--g", "1", *fast).err == ""
+    assert "--g 1" not in run("calibrate", good, *fast).err

@@ -161,6 +161,35 @@ def test_an_ascii_terminal_gets_ascii(shell):
     assert outcome.out.isascii()
 
 
+def test_zero_columns_are_no_width(shell):
+    shell("accelcal simulate > data.csv")
+    known = shell("accelcal calibrate data.csv -q").out
+    assert known
+    assert shell("accelcal calibrate data.csv -q", COLUMNS="0").out == known
+
+
+def test_what_the_encoding_of_the_terminal_lacks_is_no_failure(shell):
+    shell("accelcal simulate | sed '1s/^/pose,/; 1!s/^[^.]*\\./\u00e4&,&/' > data.csv")
+    for form in ("table", "json", "csv"):
+        outcome = shell(f"accelcal calibrate data.csv -q --format {form}", PYTHONIOENCODING="ascii")
+        assert (outcome.code, outcome.err) == (0, "")
+        assert outcome.out.isascii()
+    page = "accelcal calibrate data.csv -q -o - | accelcal report - -o -"
+    assert "\u00e4" in shell(page, PYTHONIOENCODING="latin-1").out
+
+
+def test_a_result_comes_from_standard_input(shell):
+    shell("accelcal simulate > data.csv; accelcal calibrate data.csv -q -o result.yaml")
+    assert shell("accelcal export - --to c-header < result.yaml").out.startswith("#ifndef")
+    assert shell("accelcal verify - data.csv < result.yaml").out.startswith("Verdict: unchanged")
+    outcome = shell("accelcal apply - - < result.yaml")
+    assert outcome.code == 2
+    one_line(outcome, "- -", "standard input", "name of the result file")
+    outcome = shell("accelcal export - --to c-header < data.csv")
+    assert outcome.code == 2
+    one_line(outcome, "<stdin>", "result file of a calibration")
+
+
 @pytest.mark.parametrize("busy", ["reading", "searching"])
 def test_an_interrupt_is_one_line_and_leaves_no_file(environment, tmp_path, busy):
     program = subprocess.Popen(

@@ -100,3 +100,10 @@ def test_bad_input_is_one_message(run, faces, tmp_path, arguments, message):
     assert (done.code, done.out) == (2, "")
     assert message in done.err
     assert done.err.count("\n") == 1
+
+
+def test_poses_that_determine_nothing_have_no_table_of_expectations(run):
+    outcome = run("plan", "--poses", "3")
+    assert outcome.code == 1
+    assert "Still not determined after these poses: all nine parameters" in outcome.out.replace("\n", " ")
+    assert "Expected" not in outcome.out
