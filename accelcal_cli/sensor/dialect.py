@@ -98,8 +98,9 @@ def _sample(head: bytes, source: str) -> tuple[list[tuple[int, str]], str]:
 
 
 def is_blank(line: str) -> bool:
-    """Whether a line has nothing but blanks and separators, as spreadsheets leave below a table."""
-    return not line.strip(" \t\r\n,;")
+    """Whether a line has nothing but blanks and separators, or is the note `sep=;`: spreadsheets leave both."""
+    rest = line.strip(" \t\r\n,;")
+    return not rest or rest.lower() == "sep="
 
 
 def decode_line(raw: bytes, number: int, source: str, *, strict: bool = True) -> str:

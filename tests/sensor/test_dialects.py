@@ -94,3 +94,13 @@ def test_thousands_separators_are_no_numbers() -> None:
 def test_decimal_mark_must_stay_the_same() -> None:
     with pytest.raises(DataError, match=r'line 2, column 2: "2,5" is not a number here: .* point'):
         read_readings("-", stdin=io.BytesIO(b"1.5;2;3\n1;2,5;3\n"))
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("header", [True, False])
+def test_the_separator_that_spreadsheets_note_above_a_table_is_no_row(separator, header, tmp_path):
+    rows = [[1.5, 2, 3], [4, 5, 6], [7, 8.25, 10]]
+    lines = [f"sep={separator}", *[separator.join(["ax", "ay", "az"])] * header]
+    lines += [separator.join(map(str, row)) for row in rows]
+    (tmp_path / "sheet.csv").write_text("\r\n".join(lines))
+    np.testing.assert_array_equal(read_readings(tmp_path / "sheet.csv").output(), rows)
