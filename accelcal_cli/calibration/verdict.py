@@ -51,7 +51,7 @@ def reasons_of(
         )
     if freedom == 0:
         lines.append(
-            f"Nine poses fit exactly and say nothing of their noise: no sigma. Take at least {FEWEST_POSES}."
+            f"Nine poses leave nothing to judge their noise by: no sigma. Take at least {FEWEST_POSES}."
         )
     if edge and seen.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
         lines.append(
