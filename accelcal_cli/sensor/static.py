@@ -120,7 +120,10 @@ def find_level(tiles: Tiles, rows: Rows, name: str) -> Level:
     """
     count = tiles.count - rows.width + 1
     if count < 1:
-        raise DataError(f"{name}: has {tiles.rows:,} rows, fewer than one window of {rows.window:,}")
+        raise DataError(
+            f"{name}: has {tiles.rows:,} rows, fewer than one window of {rows.window:,}; "
+            "means of poses at rest go to accelcal calibrate as they are"
+        )
     sample = list(windows(tiles, rows.width, -(-count // SAMPLE)))
     mean, variance = np.concatenate([w.mean for w in sample]), np.concatenate([w.variance for w in sample])
     noisy = variance > (ROUNDING * float(np.abs(mean).max())) ** 2
