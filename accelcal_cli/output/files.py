@@ -58,7 +58,7 @@ def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
             os.replace(temporary, target)
             temporary = ""
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+        raise _unwritten(path, error) from None
     finally:
         if temporary:
             Path(temporary).unlink(missing_ok=True)
@@ -97,10 +97,14 @@ def whole_folder(path: str) -> Iterator[Path]:
         os.replace(temporary, target)
         temporary = ""
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+        raise _unwritten(path, error) from None
     finally:
         if temporary:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _unwritten(path: str, error: OSError) -> OutputError:
+    return OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}")
 
 
 def _mode(target: Path, new: int = 0o666) -> int:
