@@ -114,15 +114,15 @@ def drawn(rng: Streams, fx: Float, rows: int, columns: int) -> Float:
 
 def each(*parts: NDArray[Any]) -> tuple[Chance, ...]:
     """Return arrays of shape (R, K, ...) as the chances of K iterations, one entry an iteration."""
-    return tuple(tuple(part[:, k] for part in parts) for k in range(parts[0].shape[1]))
+    return tuple(zip(*(part.swapaxes(0, 1) for part in parts), strict=True))
 
 
 def gather(x: Float, index: Int) -> Float:
     """Return points of each run's population, x (R, P, D) at index (R, Q): shape (R, Q, D)."""
     flat = x.transpose(0, 2, 1)
     if len(flat) == 1:
-        only: Float = flat[0].take(index[0], axis=1, mode="clip")[None]
-        return only.transpose(0, 2, 1)
+        only: Float = flat.take(index[0], axis=2).transpose(0, 2, 1)
+        return only
     out = np.empty((*flat.shape[:2], index.shape[1]))
     for source, columns, target in zip(flat, index, out, strict=True):
         source.take(columns, axis=1, out=target, mode="clip")  # "raise" would copy once more

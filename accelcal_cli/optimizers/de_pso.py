@@ -96,7 +96,7 @@ class HybridSwarm(Optimizer):
         v = self._velocity(state, r, curve)
         press(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
-        individuals = state.memory[:, half:]
+        individuals = state.memory[:, half:].copy(order="K")
         change = self._change(individuals, state.leader, picks, curve)
         change *= taken  # [dpso2014] eq. 5
         np.add(individuals, change, out=x[:, half:])

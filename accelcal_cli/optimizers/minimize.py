@@ -119,6 +119,7 @@ class _Loop:
 
     def __init__(self, problem: Problem, optimizer: Optimizer, stopping: Stopping, trace: bool) -> None:
         self.problem, self.optimizer, self.stopping, self.trace = problem, optimizer, stopping, trace
+        self.endless = stopping == NEVER
 
     def run(self, numbers: NDArray[np.int64], seed: int, x: Float | None) -> Run:
         runs = len(numbers)
@@ -153,7 +154,7 @@ class _Loop:
 
     def _retired(self, state: Any, k: int) -> Any:
         """Return the state without the runs that have ended after k steps."""
-        if state.status is None and self.stopping == NEVER:
+        if state.status is None and self.endless:
             return state
         checks = self._checks(state)
         if not any(which.any() for _, which in checks):

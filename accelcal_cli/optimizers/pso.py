@@ -8,7 +8,6 @@ is beyond the order-2 stability bound c1 + c2 < 24 (1 - w^2) / (7 - 5 w) = 3.35 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -52,21 +51,16 @@ def velocity(
 
     All of shape (R, P, D), leader (R, D), r uniform of shape (R, 2, P, D).
     """
-    pulls = np.empty_like(r)
-    social, cognitive = pulls[:, 0], pulls[:, 1]
-    np.subtract(leader[:, None], x, out=social)
-    np.subtract(memory, x, out=cognitive)
-    pulls *= r
-    pulls *= _weights(c1, c2)
+    social = leader[:, None] - x
+    social *= r[:, 0]
+    social *= c1
+    cognitive = memory - x
+    cognitive *= r[:, 1]
+    cognitive *= c2
     social += cognitive
     moved = v * inertia
     moved += social
     return moved
-
-
-@cache
-def _weights(c1: float, c2: float) -> Float:
-    return np.array([c1, c2])[:, None, None]
 
 
 @OPTIMIZERS.register("pso")
