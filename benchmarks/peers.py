@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -104,10 +105,23 @@ def fcmaes_de(objective: Objective) -> Job:
     return run
 
 
-def pygmo_batch(objective: Objective) -> Job:
+def fcmaes_cma(objective: Objective) -> Job:
+    from fcmaes.cmaescpp import ACMA_C
+    from scipy.optimize import Bounds
+
+    def run() -> None:
+        search = ACMA_C(D, Bounds(objective.lower, objective.upper), popsize=POPULATION)
+        for _ in range(ITERATIONS):
+            search.tell(objective.rows(np.asarray(search.ask())))
+
+    return run
+
+
+def pygmo_python(objective: Objective, name: str) -> Job:
+    """Minimise in C++ a function in Python: pso_gen asks for whole populations, the others for one point at a time."""
     import pygmo
 
-    class Batched:
+    class InPython:
         def fitness(self, x: Float) -> list[float]:
             return [objective.one(x)]
 
@@ -118,11 +132,20 @@ def pygmo_batch(objective: Objective) -> Job:
             return objective.lower, objective.upper
 
     def run() -> None:
-        method = pygmo.pso_gen(gen=ITERATIONS)
-        method.set_bfe(pygmo.bfe(pygmo.member_bfe()))
-        pygmo.algorithm(method).evolve(pygmo.population(pygmo.problem(Batched()), POPULATION))
+        method = _pygmo_method(name)
+        if name == "pso_gen":
+            method.set_bfe(pygmo.bfe(pygmo.member_bfe()))
+        pygmo.algorithm(method).evolve(pygmo.population(pygmo.problem(InPython()), POPULATION))
 
     return run
+
+
+def _pygmo_method(name: str) -> Any:
+    import pygmo
+
+    never = {} if name.startswith("pso") else {"ftol": 0.0, "xtol": 0.0}
+    box = {"force_bounds": True} if name == "cmaes" else {}
+    return getattr(pygmo, name)(gen=ITERATIONS, **never, **box)
 
 
 def pygmo_native(objective: Objective, name: str) -> Job:
@@ -130,15 +153,10 @@ def pygmo_native(objective: Objective, name: str) -> Job:
     import pygmo
 
     function = getattr(pygmo, objective.problem.name, pygmo.rosenbrock)(dim=D)
-    method = {
-        "pso": pygmo.pso(gen=ITERATIONS),
-        "de": pygmo.de(gen=ITERATIONS, ftol=0.0, xtol=0.0),
-        "cmaes": pygmo.cmaes(gen=ITERATIONS, ftol=0.0, xtol=0.0, force_bounds=True),
-    }[name]
 
     def run() -> int:
         population = pygmo.population(pygmo.problem(function), POPULATION)
-        return int(pygmo.algorithm(method).evolve(population).problem.get_fevals())
+        return int(pygmo.algorithm(_pygmo_method(name)).evolve(population).problem.get_fevals())
 
     return run
 
@@ -149,10 +167,14 @@ PYTHON: dict[str, Callable[[Objective], Job]] = {
     "scikit-opt DE": partial(scikit_opt, name="de"),
     "SciPy DE": scipy_de,
     "mealpy PSO": mealpy_pso,
-    "pygmo pso_gen, batched": pygmo_batch,
+    "pygmo pso, point by point": partial(pygmo_python, name="pso"),
+    "pygmo pso_gen, batched": partial(pygmo_python, name="pso_gen"),
+    "pygmo de, point by point": partial(pygmo_python, name="de"),
+    "pygmo cmaes, point by point": partial(pygmo_python, name="cmaes"),
     "fcmaes DE, ask and tell": fcmaes_de,
+    "fcmaes CMA-ES, ask and tell": fcmaes_cma,
 }
-"""Peers that minimise the same function in Python; the last two are themselves C++."""
+"""Peers that minimise the same function in Python; those of pygmo and fcmaes are themselves C++."""
 
 NATIVE: dict[str, Callable[[Objective], Job]] = {
     f"pygmo {name}, all C++": partial(pygmo_native, name=name) for name in ("pso", "de", "cmaes")
