@@ -9,8 +9,9 @@ import numpy as np
 
 from accelcal_cli import __version__
 from accelcal_cli.calibration import quality, sigma
+from accelcal_cli.calibration.cautions import cautions
 from accelcal_cli.calibration.chances import chi_square_chance
-from accelcal_cli.calibration.judgement import judge, more_than_noise, notes
+from accelcal_cli.calibration.judgement import judge, notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.quality import Observabilities
@@ -54,7 +55,10 @@ def assemble(
     covariance = sigma.covariance(known, np.array([variance]), np.array([judged.at_wall]), g)[0]
     sigma_K, sigma_D = sigma.propagate(shown.K, low.K, covariance, settings.gauge, g)
     scale_sigma = float(np.sqrt(np.diagonal(covariance)[quality.SCALE]).max()) / g
-    ratio, chance = _noise(readings, low, np.sqrt(variance), freedom)
+    s = float(np.sqrt(variance))
+    ratio, chance = noise = _noise(readings, low, s, freedom)
+    named = tuple(int(j) for j in outliers(fit.poses, readings.poses, freedom))
+    where = [readings.where(j) for j in named]
     return Calibration(
         K_a=shown.K,
         D_a=shown.D,
@@ -66,12 +70,13 @@ def assemble(
         verdict=judged.verdict,
         reasons=judged.reasons,
         suggestions=judged.suggestions,
+        cautions=(*readings.cautions, *cautions(solution, settings, s, scale_sigma, noise, where)),
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
         rms=fit.rms,
         rms_before=fit.rms_before,
         before=before,
-        s=float(np.sqrt(variance)),
+        s=s,
         freedom=freedom,
         noise_ratio=ratio,
         noise_chance=chance,
@@ -84,17 +89,13 @@ def assemble(
         runs=settings.runs,
         runs_agreeing=solution.agreeing,
         poses_fit=_pose_fits(readings, fit, low, judged.sight),
-        outliers=tuple(int(j) for j in outliers(fit.poses, readings.poses, freedom)),
+        outliers=named,
         convergence=_curve(solution),
         optimizer=settings.optimizer,
         settings=_settings_record(settings, start),
         g=g,
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
-        notes=(
-            *readings.notes,
-            *notes(solution, start, settings, np.sqrt(variance), scale_sigma),
-            *more_than_noise(ratio, chance),
-        ),
+        notes=(*readings.notes, *notes(solution, start, settings)),
         version=__version__,
         temperature=None if slopes is None else slopes.temperature,
     )

@@ -21,14 +21,6 @@ COMFORTABLE = 5.0
 
 MOST_SUGGESTIONS = 8
 
-NOISE_BIAS = 3.0
-"""Isotropic noise of standard deviation s makes scale factors too large by about 3 (s/g)^2: |f|^2 grows by 3 s^2
-on average, and the noise in the products of outputs doubles it. Measured at s/g from 0.02 to 0.1."""
-
-
-MORE_THAN_NOISE, SURELY = 2.0, 1e-3
-"""Residuals this many times their noise, and by chance this rarely, are told of."""
-
 
 @dataclass(frozen=True)
 class Judgement:
@@ -98,40 +90,11 @@ def _suggest(information: Float, seen: Observability, poses: int) -> tuple[str, 
     return tuple(describe(candidates[i]) for i in chosen)
 
 
-def more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
-    """Return a warning of residuals that the scatter within poses does not explain.
-
-    Args:
-        ratio: s over what the scatter predicts; chance: that of so large a ratio. None where nothing tells them.
-    """
-    if ratio is None or chance is None or ratio < MORE_THAN_NOISE or chance > SURELY:
-        return ()
-    return (
-        f"The residuals are {ratio:.2g} times what the scatter within the poses explains: the sensor moved in them, "
-        "changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the poses alone.",
-    )
-
-
-def notes(
-    solution: Solution, start: Start, settings: Settings, s: float, sigma_scale: float
-) -> tuple[str, ...]:
-    """Return what a user should know of the search and the noise, in sentences.
-
-    Args:
-        solution, start, settings: the calibration.
-        s: standard deviation of one pose's modulus; sigma_scale: the largest of a scale factor, as a part of it.
-    """
+def notes(solution: Solution, start: Start, settings: Settings) -> tuple[str, ...]:
+    """Return what a user should know of the search, in sentences."""
     lines = []
     if start.source == "sphere":
         lines.append("The readings fix no ellipsoid; the search started from the nearest sphere.")
     if not np.isfinite(solution.search.cost).any():
         lines.append(f"The {settings.optimizer} search failed; the result is the polished nominal sensor.")
-    if settings.runs > 1 and solution.agreeing < settings.runs:
-        lines.append(f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.")
-    bias = NOISE_BIAS * (s / settings.g) ** 2
-    if bias > sigma_scale:
-        lines.append(
-            f"The noise of one reading, {s:.3g}, is so large that it makes the scale factors about {bias:.1%} too "
-            "large, more than their sigma: average the readings of each pose first (a column that labels the pose)."
-        )
     return tuple(lines)

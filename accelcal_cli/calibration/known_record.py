@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 
 from accelcal_cli import __version__
+from accelcal_cli.calibration.cautions import large_residuals, not_fitting
 from accelcal_cli.calibration.known import Linear, fit
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS
 from accelcal_cli.calibration.nominal import nominal_before
@@ -97,6 +98,11 @@ def _assembled(
         verdict=_verdict(dop, found.freedom),
         reasons=_reasons(dop, found.freedom),
         suggestions=(),
+        cautions=(
+            *readings.cautions,
+            *large_residuals(found.s, g),
+            *not_fitting([readings.where(j) for j in named]),
+        ),
         cost_search=cost,
         cost=cost,
         rms=float(np.sqrt(np.mean(modulus**2))),

@@ -34,7 +34,9 @@ NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
 
 KINDS: dict[str, tuple[tuple[type, ...], str]] = {
     **dict.fromkeys(("freedom", "poses", "evaluations", "runs", "runs_agreeing"), ((int,), "a whole number")),
-    **dict.fromkeys(("reasons", "suggestions", "notes", "outliers", "poses_fit"), ((list,), "a list")),
+    **dict.fromkeys(
+        ("reasons", "suggestions", "cautions", "notes", "outliers", "poses_fit"), ((list,), "a list")
+    ),
     **dict.fromkeys(("data", "settings"), ((dict,), "a mapping")),
     **dict.fromkeys(("before", "optimizer", "version"), ((str,), "text")),
     **dict.fromkeys(("noise_ratio", "noise_chance"), ((int, float, type(None)), "a number")),

@@ -34,6 +34,8 @@ class Calibration:
         sigma: one-sigma of K_a and D_a.
         dop: dilution of precision.
         verdict: good, weak or undetermined; `reasons` says why in sentences.
+        suggestions: poses that would mend it.
+        cautions: sentences about residuals and search that do not change the verdict, which is of the poses.
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
@@ -62,6 +64,7 @@ class Calibration:
     verdict: str
     reasons: tuple[str, ...]
     suggestions: tuple[str, ...]
+    cautions: tuple[str, ...]
     cost_search: float
     cost: float
     rms: float
@@ -138,7 +141,7 @@ class Calibration:
         """
         if record.get("schema") != SCHEMA:
             raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
-        record = {"temperature": None, **record}
+        record = {"temperature": None, "cautions": [], **record}
         missing = [f.name for f in fields(cls) if f.name not in record]
         if missing:
             raise DataError(f"{where}: not a whole calibration result; missing: {', '.join(missing)}")

@@ -58,6 +58,7 @@ def command(
     wish = Wish(unit, replace, prefix, tilt, noise)
     calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)
+    options.caution(result, calibration.cautions, quiet)
     table = open_table(data, sys.stdin.buffer, hashed=False)
     try:
         log = prepare(calibration, table, options.split_columns(columns), wish)

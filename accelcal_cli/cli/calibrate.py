@@ -138,6 +138,8 @@ def command(
         readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     result = calibrate(readings, settings)
     _show(result, format, output, quiet)
+    if format != "table" or output == "-":  # the table shows them itself
+        options.caution(data, result.cautions, quiet)
     if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
         typer.echo(
             f"accelcal: g = {settings.g} assumed; state yours with --g or --latitude and --height "

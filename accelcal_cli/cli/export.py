@@ -46,6 +46,7 @@ def command(
         raise UsageError("--to numpy is no text for a terminal; name a file with -o")
     calibration = options.load_result(result)
     calibration.check_determined(result, force=force)
+    options.caution(result, calibration.cautions, quiet)
     made = export(calibration, to, Target(instance, driver_scale))
     with whole_file(output, binary=True) as file:
         file.write(made.content)

@@ -11,8 +11,9 @@ import typer
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.sensor.readings import Readings
 
 FORMATS = ("table", "json", "csv")
 
@@ -88,13 +89,10 @@ def gravity(g: float | None, latitude: float | None, height: float | None) -> fl
     return None if latitude is None else normal_gravity(latitude, height or 0.0)
 
 
-def warn_of_moves(readings: Readings, quiet: bool) -> None:
-    """Say on standard error, unless quiet, when readings look like a raw log; for commands without notes."""
-    from accelcal_cli.sensor.collect import EACH_ROW
-
-    for note in readings.notes:
-        if note.startswith(EACH_ROW) and not quiet:
-            typer.echo(f"accelcal: {readings.source}: {note}", err=True)
+def caution(source: str, cautions: Iterable[str], quiet: bool) -> None:
+    """Say on standard error, unless quiet, what speaks against trusting a file."""
+    for text in () if quiet else cautions:
+        typer.echo(f"accelcal: {source}: caution: {text}", err=True)
 
 
 def check_tolerance(tolerance: float | None) -> None:

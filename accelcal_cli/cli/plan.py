@@ -99,7 +99,7 @@ def _so_far(data: str, columns: str | None, g: float | None, quiet: bool) -> Cal
     options.check_input(data)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
-    options.warn_of_moves(readings, quiet)
+    options.caution(readings.source, readings.cautions, quiet)
     return calibrate(readings, settings)
 
 

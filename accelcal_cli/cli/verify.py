@@ -50,7 +50,7 @@ def command(
     old = options.load_result(result, data)
     _check_gravity(g, old, result)
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
-    options.warn_of_moves(readings, quiet)
+    options.caution(readings.source, readings.cautions, quiet)
     found = verify(old, readings, level, tolerance)
     _show(found, format)
     if not found.within and not quiet:

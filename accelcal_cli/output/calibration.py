@@ -13,14 +13,9 @@ NARROWEST_CURVE = 40
 def show_calibration(result: Calibration) -> None:
     """Print a calibration to standard output."""
     out = rich_console.console()
-    rich_console.verdict(result.verdict, result.reasons, out)
+    rich_console.verdict(result.verdict, result.reasons, out, result.cautions)
     out.print()
     rich_console.show(tables(result), out)
-    if result.outliers:
-        named = {p.pose: p.where for p in result.poses_fit}
-        out.print(
-            f"Outliers: {', '.join(named[j] for j in result.outliers)}. Measure them again, or use --robust."
-        )
     for note in result.notes:
         out.print(f"Note: {note}")
     if len(result.convergence) > 1 and out.width >= NARROWEST_CURVE and out.encoding.startswith("utf"):

@@ -144,8 +144,10 @@ def _drawn(table: Table, out: Console) -> Text:
     return Text.assemble((head, "bold"), "\n", body, no_wrap=True, overflow="ignore")
 
 
-def verdict(word: str, sentences: Iterable[str], out: Console) -> None:
-    """Print the verdict and what it rests on."""
+def verdict(word: str, sentences: Iterable[str], out: Console, cautions: Iterable[str] = ()) -> None:
+    """Print the verdict, what it rests on, and what it does not look at."""
     out.print(Text.assemble(("Verdict: ", "bold"), (word, VERDICT_STYLE.get(word, "bold"))))
     for sentence in sentences:
         out.print(Text(f"  {sentence}"))
+    for caution in cautions:
+        out.print(Text.assemble(("Caution: ", "bold yellow"), caution))

@@ -22,9 +22,6 @@ RAW_ROWS = 500
 ALIKE, LOOKED_AT = 0.05, 4096
 """Poses are turned from one to the next; most of the first rows of a log differ by less than this part of the range."""
 
-EACH_ROW = "each row is taken for a pose at rest"
-"""How the note on what may be a raw log begins."""
-
 
 @dataclass
 class Extent:
@@ -67,7 +64,7 @@ class Collector:
         """Expect rows as `columns.selection()` asks for them."""
         self.source = source
         self.columns = columns
-        self.notes = list(columns.notes)
+        self.notes, self.cautions = list(columns.notes), list[str]()
         self.store = RowStore()
         self.extent = Extent()
         self._means = None if columns.label is None else LabelledMeans[str](source, 3 + _others(columns))
@@ -123,9 +120,10 @@ class Collector:
 
     def _by_row(self) -> Extras:
         if self.store.rows >= RAW_ROWS and (self.columns.time is not None or self._creeps()):
-            self.notes.append(
-                f"{EACH_ROW}; if these {self.store.rows:,} rows are a log with moves in it, find its poses with "
-                "accelcal detect, or calibrate with --raw; of many readings of one pose, label the poses in a column"
+            self.cautions.append(
+                f"Each row is taken for a pose at rest. If these {self.store.rows:,} rows are a log with moves in it, "
+                "find its poses with accelcal detect, or calibrate with --raw; of many readings of one pose, label the "
+                "poses in a column."
             )
         if not self._extras:
             return Extras()

@@ -40,6 +40,7 @@ class Readings:
     reference: Floats | None = None  # (J, 3) known specific force, m/s^2 or g as given
     temperature: Floats | None = None  # (J,) as given, nan where missing
     notes: tuple[str, ...] = ()  # what the reader did that a user should know
+    cautions: tuple[str, ...] = ()  # why the readings may not be what they are taken for
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 
@@ -110,6 +111,7 @@ class Readings:
             reference=extras.reference,
             temperature=extras.temperature,
             notes=tuple(collector.notes),
+            cautions=tuple(collector.cautions),
             _store=collector.store,
             _line=line,
         )

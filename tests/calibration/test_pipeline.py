@@ -449,12 +449,12 @@ def test_scatter_within_poses_is_compared_with_the_fit():
     result = calibrate(honest, FAST)
     assert result.noise_ratio == pytest.approx(1.0, abs=0.5)
     assert result.noise_chance > 0.01
-    assert not any("residuals" in note for note in result.notes)
+    assert result.cautions == ()
     wrong = Readings.from_array(
         DPSO.output(G * poses.turns() + 20 * noise_of_means), count=n, scatter=scatter
     )
     result = calibrate(wrong, FAST)
     assert result.noise_ratio > 10
     assert result.noise_chance < 1e-6
-    assert any(f"residuals are {result.noise_ratio:.2g} times" in note for note in result.notes)
+    assert any(f"residuals are {result.noise_ratio:.2g} times" in caution for caution in result.cautions)
     assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).noise_ratio is None

@@ -24,6 +24,7 @@ CONTRACT = {
     "verdict": str,
     "reasons": list,
     "suggestions": list,
+    "cautions": list,
     "cost_search": NUMBER,
     "cost": NUMBER,
     "rms": NUMBER,
@@ -246,3 +247,18 @@ def test_readings_in_g_that_are_compared_with_metres_are_told(run, good):
     assert "go with --g 1" in run("calibrate", "g.csv", *fast).err
     assert run("calibrate", "g.csv", "--g", "1", *fast).err == ""
     assert "--g 1" not in run("calibrate", good, *fast).err
+
+
+def test_cautions_stand_under_the_verdict_and_go_with_the_result(run):
+    run("simulate", "--positions", "24", "--noise", "0.1", "--seed", "1", "-o", "noisy.csv")
+    shown = run("calibrate", "noisy.csv", "--optimizer", "ellipsoid", "-o", "noisy.yaml", "--quiet")
+    first, second, *_ = shown.out.splitlines()
+    assert (first, shown.code, shown.err) == ("Verdict: good", 0, "")
+    assert second.startswith("Caution: After calibration one pose errs by ")
+    said = "accelcal: noisy.csv: caution: After calibration one pose errs by "
+    for form in ("csv", "json"):
+        assert said in run("calibrate", "noisy.csv", "--optimizer", "ellipsoid", "--format", form).err
+    said = "accelcal: noisy.yaml: caution: After calibration one pose errs by "
+    assert run("export", "noisy.yaml", "--to", "imucal").err.startswith(said)
+    assert run("apply", "noisy.yaml", "noisy.csv", "-o", "forces.csv").err.startswith(said)
+    assert run("export", "noisy.yaml", "--to", "imucal", "--quiet").err == ""

@@ -106,7 +106,7 @@ def test_the_verdict_comes_first(kind):
     result = _result(kind)
     text = re.sub(r"\s+", " ", Reader(_page(kind)).text)
     assert text.index(f"Verdict: {result.verdict}") < text.index("Parameters")
-    for sentence in (*result.reasons, *result.notes, result.before):
+    for sentence in (*result.reasons, *result.cautions, *result.notes, result.before):
         assert typeset(sentence) in text
 
 

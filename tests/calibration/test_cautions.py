@@ -1,0 +1,86 @@
+"""Cautions: what the residuals and the search say against a calibration whose poses determine it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated import DPSO, noise, readings
+
+from accelcal_cli.calibration import cautions
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.readings import Readings
+
+G = 9.8
+FAST = Settings(optimizer="levenberg-marquardt", g=G)
+
+
+def _said(result, words):
+    return [words in caution for caution in result.cautions]
+
+
+def test_an_honest_calibration_has_none():
+    assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).cautions == ()
+    assert calibrate(readings(poses.turns()), FAST).cautions == ()
+
+
+@pytest.mark.parametrize(("sigma", "expected"), [(0.02, False), (0.1, True)])
+def test_residuals_that_are_large_beside_g_are_told(sigma, expected):
+    """24 poses of 0.2 % and of 1 % of g: the verdict, which is of the poses, is good for both."""
+    result = calibrate(readings(poses.turns(), sigma=sigma), FAST)
+    assert result.verdict == "good"
+    assert any(_said(result, "of g, where 0.5%")) is expected
+    if expected:
+        assert f"{result.s / G:.2%} of g" in result.cautions[0]
+
+
+def test_random_numbers_are_told():
+    output = np.random.default_rng(1).uniform(-100, 100, (40, 3))
+    result = calibrate(Readings.from_array(output), replace(FAST, g=1.0))
+    assert result.verdict == "undetermined" or any(_said(result, "of g, where"))
+
+
+def test_poses_that_do_not_fit_are_named_by_line():
+    u = poses.turns()
+    errors = noise(24, 1e-3, 2)
+    errors[7] += 0.03 * u[7]
+    data = Readings.from_array(DPSO.output(G * u + errors))
+    (caution,) = calibrate(data, FAST).cautions
+    assert caution == "Beyond chance off the others: pose 8. Measure it again, or use --robust."
+    (caution,) = calibrate(data, replace(FAST, robust="huber")).cautions
+    assert caution == "Beyond chance off the others: pose 8. Measure it again."
+
+
+def test_many_poses_that_do_not_fit_are_not_all_named():
+    names = [f"line {n}" for n in range(2, 14)]
+    (caution,) = cautions.not_fitting(names)
+    assert caution == (
+        "Beyond chance off the others: line 2, line 3, line 4, line 5, line 6, line 7, line 8, line 9 and 4 more. "
+        "Measure them again."
+    )
+    assert cautions.not_fitting([]) == ()
+
+
+def test_noise_that_moves_the_scale_factors_is_told():
+    """16 000 samples with noise of 5 % of g: sigma falls with their number, the bias of the scale factors does not."""
+    u = noise(16_000, 1.0, 3)
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    result = calibrate(readings(u, sigma=0.5), FAST)
+    assert any(_said(result, "0.8% too large"))
+    assert not any(_said(calibrate(readings(poses.turns(), sigma=0.02), FAST), "too large"))
+
+
+def test_cautions_of_readings_come_first():
+    data = replace(readings(poses.turns(), sigma=0.1), cautions=("These are no poses.",))
+    assert calibrate(data, FAST).cautions[0] == "These are no poses."
+
+
+def test_a_record_without_cautions_is_read():
+    record = calibrate(readings(poses.turns(), sigma=0.1), FAST).record()
+    assert Calibration.from_record(record, "r").cautions == tuple(record["cautions"]) != ()
+    del record["cautions"]
+    assert Calibration.from_record(record, "r").cautions == ()
