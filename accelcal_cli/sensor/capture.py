@@ -174,7 +174,7 @@ class Capture:
         mean = self.window.mean(axis=0)
         rough = self.rough or rough_sensor(mean[None], *self.stated)
         limit = STILL * rough.scale if self.still is None else self.still
-        spread = float(self.window.std(axis=0).max())
+        spread = float((self.window - reading).std(axis=0).max())
         state = self._step(reading, mean, rough, quiet=spread <= limit, limit=limit)
         direction = (self.rough or rough).directions(mean)
         nearest, angle = _nearest(direction, self.planned)
@@ -194,7 +194,8 @@ class Capture:
         if held.std(axis=0).max() > limit:  # it drifts, too slowly for the window to tell
             self.run = self.run[-len(self.window) :]
             return "still"
-        self._take(Held(len(held), held.mean(axis=0), held.std(axis=0, ddof=1)))
+        away = held - reading  # so that equal readings have no spread, and their own value as mean
+        self._take(Held(len(held), reading + away.mean(axis=0), away.std(axis=0, ddof=1)))
         return "taken"
 
     def _take(self, held: Held) -> None:
