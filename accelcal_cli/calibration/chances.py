@@ -38,7 +38,7 @@ class Noise:
     freedom: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """Two noises, and what they say of each other: squares of ratios b / a and their weights, both shape (n,)."""
 
@@ -122,9 +122,9 @@ def student_chance(t: Float, freedom: Int) -> Float:
     eq. 26.7.3 and 26.7.4.
     """
     chance = np.empty(len(t))
-    for n in np.unique(freedom):
+    for n in set(freedom.tolist()):  # np.unique would import numpy.ma, a tenth of a start
         own = freedom == n
-        chance[own] = _student(t[own], int(n))
+        chance[own] = _student(t[own], n)
     return chance
 
 

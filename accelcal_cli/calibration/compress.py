@@ -21,7 +21,7 @@ PIECE = 512
 """Rows of one small QR; LAPACK's panel of 512 x 11 stays in the first-level cache."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Triangle:
     """The compressed readings of R sensors.
 

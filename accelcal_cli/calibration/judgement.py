@@ -22,7 +22,7 @@ COMFORTABLE = 5.0
 MOST_SUGGESTIONS = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Judgement:
     """What is said of a solution.
 

@@ -44,7 +44,7 @@ def unpack(theta: Float) -> tuple[Float, Float]:
     return K, theta[..., -3:]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Box:
     """The search box in the units of the readings.
 

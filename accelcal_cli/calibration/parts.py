@@ -8,7 +8,7 @@ from accelcal_cli.calibration.quality import BIAS, MISALIGNMENT, PARAMETERS, SCA
 from accelcal_cli.streams import Float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sigma:
     """One-sigma of the parameters; NaN where the poses do not determine them.
 

@@ -60,7 +60,7 @@ more than 1000 times the noise of a pose. Without it a direction that the poses 
 parameter along that it touches by a part in a thousand."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observability:
     """What a set of poses says about the nine parameters.
 
@@ -97,7 +97,7 @@ class Observability:
         return [PARAMETERS[i] for i in order if self.bounded[i] > limit]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observabilities:
     """What R sets of poses say about the parameters; see `Observability`.
 

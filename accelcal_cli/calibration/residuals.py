@@ -22,7 +22,7 @@ OUTLIER_LEVEL = 0.01
 """Chance of naming an outlier among all poses where there is none (Bonferroni over the poses)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseResiduals:
     """Residuals of chosen poses.
 

@@ -22,7 +22,7 @@ SCHEMA = "accelcal/calibration/1"
 """Name and version of the record; a reader refuses what it does not know."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """A calibrated accelerometer. Units: f in m/s^2 (units of g when g = 1), N in output units.
 

@@ -29,7 +29,7 @@ REWEIGHTINGS = 50
 """Robust rounds at most; they converge in about ten."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """What search and polish found.
 

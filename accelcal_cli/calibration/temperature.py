@@ -31,7 +31,7 @@ STEPS, SETTLED = 30, 1e-12
 """Gauss-Newton steps at most, and the step, as part of g, that ends them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Temperature:
     """How a sensor changes with temperature; the other parameters of a result hold at `reference`.
 
@@ -77,7 +77,7 @@ class Temperature:
         return brought
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Slopes:
     """A fit of fifteen parameters.
 

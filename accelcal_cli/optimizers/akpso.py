@@ -21,7 +21,7 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KalmanState(State):
     """A swarm with its filters; x is the filtered position."""
 

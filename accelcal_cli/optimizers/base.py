@@ -29,7 +29,7 @@ RUNNING, CONVERGED, FAILED = 0, 1, 2
 """Values of `State.status`: go on, nothing left to gain, numerical failure."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """What an optimizer carries from step to step; each algorithm adds its own fields.
 

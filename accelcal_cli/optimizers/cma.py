@@ -52,7 +52,7 @@ class Constants:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CmaState(State):
     """A search distribution for each run; x and fx are its last samples."""
 

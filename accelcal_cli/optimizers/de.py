@@ -45,7 +45,7 @@ def mutates(u: Float, share: float, gene: Int) -> Float:
     return taken
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Generation(State):
     """A population; x and fx are the individuals and their costs."""
 

@@ -33,7 +33,7 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Int, Streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HybridState(State):
     """Both halves, the swarm first: x and fx are the points of the last evaluation, positions and trials."""
 

@@ -17,7 +17,7 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlaneState(State):
     """Swarms in the plane: x and fx are the last candidates S and their smells."""
 

@@ -27,7 +27,7 @@ PART_OF_BOX = 0.4
 box of 5 %, which is what the paper's 1e4 pulses are."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FlyState(State):
     """Swarms on a line: x and fx are the last candidates and their smells."""
 

@@ -20,7 +20,7 @@ F = np.array([[1.0, 1.0], [0.0, 1.0]])
 """Transition of (position, velocity)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FilterState(State):
     """Filters of position and velocity, in half-widths of the box; x and fx are the sampled positions."""
 

@@ -17,7 +17,7 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Bool, Float, Streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DampedState(State):
     """Points with their linearisation."""
 

@@ -33,7 +33,7 @@ class Status(Enum):
     FAILED = "numerical failure"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """The outcome of R runs.
 

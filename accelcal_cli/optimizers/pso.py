@@ -27,7 +27,7 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SwarmState(State):
     """A swarm: x and fx are the positions and their costs."""
 

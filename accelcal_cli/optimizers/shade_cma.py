@@ -22,7 +22,7 @@ from accelcal_cli.registry import setting
 from accelcal_cli.streams import Bool, Float, Int, Streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ShadeState(State):
     """Phase one: the population with its memories and archive."""
 

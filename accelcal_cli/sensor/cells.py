@@ -29,7 +29,7 @@ class Selection:
     texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rows:
     """A block of rows: `numbers` (B, k) and `texts`, each of length B, in the order of the selection."""
 

@@ -46,7 +46,7 @@ class Extent:
         return bool((self.lower == self.upper).all())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Extras:
     """What is known of each pose beside its output; see `Readings` for shapes and units."""
 

@@ -46,7 +46,7 @@ def to_gauge(K: Float, gauge: str) -> Float:
     return root
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ErrorModel:
     """Scale factors, misalignments and bias of one accelerometer.
 
