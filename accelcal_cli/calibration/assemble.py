@@ -15,10 +15,10 @@ from accelcal_cli.calibration.judgement import judge, notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.quality import Observabilities
-from accelcal_cli.calibration.residuals import Fit, examine, outliers
+from accelcal_cli.calibration.residuals import NO_NOISE, Fit, examine, outliers
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import loss_weight, robust_variance
-from accelcal_cli.calibration.search import NO_NOISE, Solution, lower_problem, model_at
+from accelcal_cli.calibration.search import Solution, lower_problem, model_at
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.temperature import SLOPES, Slopes
 from accelcal_cli.sensor.model import ErrorModel

@@ -44,9 +44,9 @@ def cautions(
         outlying: the poses that do not fit, by line or label.
     """
     return (
+        *not_fitting(outlying, "or use --robust" if settings.robust == "none" else ""),
         *large_residuals(s, settings.g),
         *_more_than_noise(*noise),
-        *not_fitting(outlying, "or use --robust" if settings.robust == "none" else ""),
         *_noise_bias(s, settings.g, sigma_scale),
         *_search(solution, settings),
     )

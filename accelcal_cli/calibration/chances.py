@@ -116,12 +116,12 @@ def holm(chances: Float) -> Float:
 
 
 def student_chance(t: Float, freedom: Int) -> Float:
-    """Return the chance of an absolute value of t > 0 or more under Student's distribution, shape (n,).
+    """Return the chance of an absolute value of t > 0, or infinite, or more under Student's distribution, shape (n,).
 
     The finite sums in powers of cos^2 a, tan a = t / sqrt(n), that hold for whole degrees of freedom [abramowitz1964]
     eq. 26.7.3 and 26.7.4.
     """
-    chance = np.empty(len(t))
+    chance, t = np.empty(len(t)), np.minimum(t, 1e150)  # the square of which is still a number
     for n in set(freedom.tolist()):  # np.unique would import numpy.ma, a tenth of a start
         own = freedom == n
         chance[own] = _student(t[own], n)

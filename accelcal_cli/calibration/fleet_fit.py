@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from accelcal_cli.calibration import quality
+from accelcal_cli.calibration.left_out import leave_out
 from accelcal_cli.calibration.lotters import Loetters
 from accelcal_cli.calibration.nominal import Start, taken_for
 from accelcal_cli.calibration.quality import Observabilities
-from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
+from accelcal_cli.calibration.residuals import beyond_chance, is_suspect, leverages, room_of, studentise
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verdict import edge_names, reasons_of
 from accelcal_cli.errors import DataError
@@ -69,6 +70,8 @@ def residuals(
     freedom = poses[:, None] - 9
     total = np.sum(scaled**2, axis=1, keepdims=True)
     far = np.where(real, np.abs(studentise(scaled, room, total, freedom)), np.nan)
+    sensor, pose = np.nonzero(is_suspect(far, size - g, freedom, g) & real)
+    far[sensor, pose] = np.abs(leave_out(force[sensor], w[sensor], pose, g).studentised)
     outlying = beyond_chance(far, *(np.broadcast_to(a, far.shape) for a in (poses[:, None], freedom)))
     words = np.full(len(poses), "", dtype=object)
     for at in np.flatnonzero(outlying.any(axis=1)):

@@ -100,8 +100,8 @@ def _assembled(
         suggestions=(),
         cautions=(
             *readings.cautions,
-            *large_residuals(found.s, g),
             *not_fitting([readings.where(j) for j in named]),
+            *large_residuals(found.s, g),
         ),
         cost_search=cost,
         cost=cost,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.calibration.chances import student_chance
+from accelcal_cli.calibration.left_out import leave_out
 from accelcal_cli.calibration.quality import design
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
@@ -17,6 +18,15 @@ KEPT = 1000
 """Poses whose residuals a result keeps one by one; of more, the worst KEPT_WORST."""
 
 KEPT_WORST = 20
+
+NO_NOISE = 1e-12
+"""Residuals, or their standard deviation, below this part of g are rounding."""
+
+SUSPECT = 3.0
+"""Studentised residuals beyond this may be outliers: those of Student's t with any freedom are as large at least."""
+
+BENT = 0.01
+"""A residual beyond this part of g bends the fit so far that no first-order formula holds."""
 
 OUTLIER_LEVEL = 0.01
 """Chance of naming an outlier among all poses where there is none (Bonferroni over the poses)."""
@@ -142,9 +152,29 @@ def _judge(
     size = np.linalg.norm(f, axis=1)
     leverage = leverages(design(f / size[:, None]), w, cofactor)
     room = room_of(leverage)
-    studentised = studentise(scaled, room, weighted_sum, freedom)
-    before = length_error(e_before, g)
-    return PoseResiduals(pose, size - g, before, f, leverage, studentised, (size - g) / room)
+    error, studentised = size - g, studentise(scaled, room, weighted_sum, freedom)
+    left_out = error / room
+    suspect = np.flatnonzero(is_suspect(studentised, error, freedom, g))
+    if len(pose) < freedom + 9:  # of so many poses none bends the fit, unless it is beyond all measure
+        blown = suspect[np.isnan(studentised[suspect])]
+        studentised[blown] = np.copysign(np.inf, error[blown])
+    elif len(suspect):
+        alone = leave_out(
+            np.broadcast_to(f, (len(suspect), *f.shape)), np.tile(w, (len(suspect), 1)), suspect, g
+        )
+        studentised[suspect], left_out[suspect] = alone.studentised, alone.error
+    return PoseResiduals(pose, error, length_error(e_before, g), f, leverage, studentised, left_out)
+
+
+def is_suspect(studentised: Float, error: Float, freedom: Int | int, g: float) -> Bool:
+    """Return which poses may be outliers, or bend the fit too far for the first-order formula, shape (..., J).
+
+    Args:
+        studentised: by that formula, NaN where it has nothing to say; error: |f| - g, m/s^2.
+        freedom: J - 9, a scalar or of shape (..., 1).
+    """
+    large = ~(np.abs(studentised) <= SUSPECT) & (np.abs(error) > NO_NOISE * g)
+    return np.asarray((large | (np.abs(error) > BENT * g)) & (np.asarray(freedom) >= 2))
 
 
 def leverages(rows: Float, w: Float, cofactor: Float) -> Float:
@@ -192,7 +222,7 @@ def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
     Args:
         size: absolute values, NaN for none; poses, freedom: of their sensor, same shape.
     """
-    found: Bool = np.asarray(size > 3.0)  # Student's t has heavier tails than any bound of 3.
+    found: Bool = np.asarray(size > SUSPECT)
     suspect = np.flatnonzero(found & (freedom >= 2))
     chance = poses.flat[suspect] * student_chance(size.flat[suspect], freedom.flat[suspect] - 1)
     found[...] = False

@@ -9,6 +9,7 @@ import numpy as np
 from accelcal_cli.calibration import robust
 from accelcal_cli.calibration.compress import compress
 from accelcal_cli.calibration.lotters import Box, Loetters
+from accelcal_cli.calibration.residuals import NO_NOISE
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.optimizers.base import OPTIMIZERS
 from accelcal_cli.optimizers.minimize import Run, minimize
@@ -21,9 +22,6 @@ SAME_MINIMUM = 1e-6
 
 ROUNDING = 1e-26
 """A cost per reading, in units of g^4, below which only rounding is left."""
-
-NO_NOISE = 1e-12
-"""A robust standard deviation below this part of g is rounding: every weight is 1."""
 
 REWEIGHTINGS = 50
 """Robust rounds at most; they converge in about ten."""

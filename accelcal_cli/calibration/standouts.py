@@ -10,8 +10,8 @@ from accelcal_cli.calibration.chances import chi_square_chance, student_chance
 from accelcal_cli.calibration.fleet import Fleet
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS
 from accelcal_cli.calibration.quality import MISALIGNMENT, PARAMETERS
+from accelcal_cli.calibration.residuals import NO_NOISE
 from accelcal_cli.calibration.robust import NORMAL_MAD
-from accelcal_cli.calibration.search import NO_NOISE
 from accelcal_cli.sensor import units
 from accelcal_cli.streams import Float
 

@@ -196,7 +196,7 @@ def observability(result: Calibration) -> Table:
 
 def worst_poses(result: Calibration) -> Table:
     """Return the poses with the largest studentised residuals, and those named as outliers."""
-    size = [abs(p.studentised) if np.isfinite(p.studentised) else abs(p.residual) for p in result.poses_fit]
+    size = [abs(p.residual if np.isnan(p.studentised) else p.studentised) for p in result.poses_fit]
     order = np.argsort(-np.array(size), kind="stable")[:WORST_SHOWN]
     rows = tuple(
         (

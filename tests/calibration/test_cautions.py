@@ -10,6 +10,7 @@ from simulated import DPSO, noise, readings
 
 from accelcal_cli.calibration import cautions
 from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.quality import design
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.sensor import poses
@@ -84,3 +85,39 @@ def test_a_record_without_cautions_is_read():
     assert Calibration.from_record(record, "r").cautions == tuple(record["cautions"]) != ()
     del record["cautions"]
     assert Calibration.from_record(record, "r").cautions == ()
+
+
+@pytest.mark.parametrize("size", [0.5, 0.9, 0.95, 0.99, 1.05, 1.3, 2.0])
+def test_a_wrong_pose_is_named_however_wrong_it_is(size):
+    """One pose of 24, each in turn, longer or shorter: it comes first, and no other is named.
+
+    By the first-order formula a pose that is 5 % off explains more than there is, and is passed over.
+    """
+    u = poses.turns()
+    for wrong in range(24):
+        force = G * u + noise(24, 1e-3, 2)
+        force[wrong] *= size
+        result = calibrate(Readings.from_array(DPSO.output(force)), FAST)
+        assert result.outliers == (wrong,)
+        assert np.nanargmax([abs(pose.studentised) for pose in result.poses_fit]) == wrong
+
+
+def test_a_pose_left_out_is_what_a_calibration_without_it_says():
+    u = poses.turns()
+    force = G * u + noise(24, 1e-3, 2)
+    force[5] *= 0.9
+    seen = calibrate(Readings.from_array(DPSO.output(force)), FAST).poses_fit[5]
+    others = calibrate(Readings.from_array(DPSO.output(np.delete(force, 5, axis=0))), FAST)
+    error = np.linalg.norm(others.model.specific_force(DPSO.output(force[5:6]))) - G
+    assert seen.left_out == pytest.approx(error, rel=1e-9)
+    (row,) = design(u[5:6])
+    h = float(row @ others.covariance @ row) / others.s**2
+    assert seen.studentised == pytest.approx(error / (others.s * np.sqrt(1.0 + h)), rel=0.06)
+
+
+@pytest.mark.parametrize("size", [0.5, 0.99, 1.5])
+def test_a_wrong_pose_among_very_many_is_named(size):
+    """Of more than 1000 poses none is left out; what explains more than there is, is beyond chance."""
+    force = G * poses.fibonacci(1500) + noise(1500, 1e-3, 2)
+    force[700] *= size
+    assert calibrate(Readings.from_array(DPSO.output(force)), FAST).outliers == (700,)

@@ -1,0 +1,87 @@
+"""Fits that leave one pose out: what a pose looks like to the others, without the first-order formula.
+
+The formula of linear regression subtracts a pose's part from the sum of squares. A pose that is wrong by several per
+cent bends the fit so far that its part comes out larger than the whole, and the formula has nothing to say of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.calibration.lotters import ROWS_COLUMNS
+from accelcal_cli.calibration.quality import design
+from accelcal_cli.streams import Bool, Float, Int
+
+STEPS, SETTLED = 12, 1e-9
+"""Gauss-Newton steps at most, and the part of g below which a step is the last but for its square."""
+
+LEAST_ROOM = 1e-8
+"""Least eigenvalue, as a part of their sum, at which the other poses still determine a sensor by themselves."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Poses seen by fits without them.
+
+    Attributes:
+        error: |f| - g of the pose left out, m/s^2, shape (S,).
+        studentised: the same over its standard deviation, from the residuals of the others, shape (S,).
+            Both NaN where the others do not determine the sensor, or where fewer than ten are left.
+    """
+
+    error: Float
+    studentised: Float
+
+
+def leave_out(force: Float, weights: Float, pose: Int, g: float) -> LeftOut:
+    """Fit S sensors anew, each without one of its poses.
+
+    Args:
+        force: specific force by the fit with all poses, m/s^2, shape (S, J, 3).
+        weights: of the poses, 0 for none, shape (S, J).
+        pose: which one to leave out, shape (S,).
+        g: local gravity, m/s^2.
+    """
+    sensors = np.arange(len(pose))
+    kept = weights.copy()
+    kept[sensors, pose] = 0.0
+    with np.errstate(all="ignore"):
+        for _ in range(STEPS):
+            e, rows, cofactor = _linearised(force, kept, g)
+            step = -(cofactor @ (rows.swapaxes(1, 2) @ (kept * e)[..., None]))[..., 0]
+            force = _moved(force, step, g)
+            if not np.any(np.abs(step) > SETTLED * g):
+                break
+        e, rows, cofactor = _linearised(force, kept, g)
+        freedom = np.count_nonzero(kept, axis=1) - 9
+        variance = np.sum(kept * e * e, axis=1) / np.where(freedom > 0, freedom, np.nan)
+        at = rows[sensors, pose]
+        spread = 1.0 / weights[sensors, pose] + np.sum((cofactor @ at[..., None])[..., 0] * at, axis=1)
+        error = np.linalg.norm(force[sensors, pose], axis=1) - g
+        return LeftOut(error, -e[sensors, pose] / np.sqrt(variance * spread))
+
+
+def _linearised(force: Float, weights: Float, g: float) -> tuple[Float, Float, Float]:
+    """Return e = (g^2 - |f|^2) / 2g, its derivatives by the changes of `_moved`, and the inverse of their products.
+
+    Shapes (S, J), (S, J, 9) and (S, 9, 9); NaN where the weighted poses do not determine a sensor.
+    """
+    e = (g * g - np.sum(force * force, axis=2)) / (2.0 * g)
+    rows = design(force / g)
+    normal = (rows * weights[..., None]).swapaxes(1, 2) @ rows
+    known: Bool = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
+    known[known] = np.linalg.eigvalsh(normal[known])[:, 0] > LEAST_ROOM * np.einsum("spp->s", normal[known])
+    cofactor = np.full_like(normal, np.nan)
+    cofactor[known] = np.linalg.inv(normal[known])
+    return e, rows, cofactor
+
+
+def _moved(force: Float, step: Float, g: float) -> Float:
+    """Return (I + E) f - b, with the lower triangle E (times g) and b from a step, m/s^2, shape (S, 9)."""
+    E = np.zeros((len(step), 3, 3))
+    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+        E[:, i, j] = step[:, p] / g
+    moved: Float = force + force @ E.swapaxes(1, 2) - step[:, None, 6:]
+    return moved
