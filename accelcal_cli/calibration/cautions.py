@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from accelcal_cli.calibration.search import Solution
+import numpy as np
+
+from accelcal_cli.calibration.search import Solution, rounding
 from accelcal_cli.calibration.settings import Settings
 
 MORE_THAN_NOISE, SURELY = 2.0, 1e-3
@@ -19,6 +21,12 @@ MOST_NAMED = 8
 LARGE = 0.005
 """A noise of one pose above this part of g is told of. Data sheets of MEMS accelerometers state nonlinearities of up to
 0.5 % of full scale, and the real recordings of the tests leave 0.01 to 0.04 %."""
+
+STOPPED_SHORT = 0.01
+"""Part of the cost that one more step would take off, from which on a search is told to be unfinished."""
+
+EARTH = 9.76, 9.84
+"""Gravity on Earth, m/s^2, from the top of the Andes to the Arctic Ocean."""
 
 NOISE_BIAS = 3.0
 """Isotropic noise of standard deviation s makes scale factors too large by about 3 (s/g)^2: |f|^2 grows by 3 s^2
@@ -49,6 +57,7 @@ def cautions(
         *_more_than_noise(*noise),
         *_noise_bias(s, settings.g, sigma_scale),
         *_search(solution, settings),
+        *_gravity(settings.g),
     )
 
 
@@ -95,6 +104,32 @@ def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:
 
 
 def _search(solution: Solution, settings: Settings) -> tuple[str, ...]:
+    lines = []
+    left = 0.0 if settings.polish else _to_gain(solution)
+    if left > STOPPED_SHORT:
+        lines.append(
+            f"The search stopped short of the minimum: a step more would take {left:.0%} off the cost. "
+            "Leave out --no-polish, or search longer."
+        )
     if settings.runs > 1 and solution.agreeing < settings.runs:
-        return (f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.",)
-    return ()
+        lines.append(f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.")
+    return tuple(lines)
+
+
+def _to_gain(solution: Solution) -> float:
+    """Return the part of the cost that a Gauss-Newton step is expected to take off, 0 where only rounding is left."""
+    problem, x = solution.problem, solution.x[:, None]
+    if solution.cost <= rounding(problem):
+        return 0.0
+    residual, slope = problem.residuals(x)[0, 0], problem.jacobian(x)[0, 0]
+    step = np.linalg.lstsq(slope, residual)[0]
+    return float(np.sum((slope @ step) ** 2) / np.sum(residual**2))
+
+
+def _gravity(g: float) -> tuple[str, ...]:
+    if g == 1.0 or EARTH[0] <= g <= EARTH[1]:
+        return ()
+    return (
+        f"g = {g:g} is neither gravity on Earth, {EARTH[0]} to {EARTH[1]} m/s^2, nor 1, for readings in units of g: "
+        "scale factors are proportional to it.",
+    )

@@ -102,6 +102,7 @@ def _assembled(
             *readings.cautions,
             *not_fitting([readings.where(j) for j in named]),
             *large_residuals(found.s, g),
+            *_turned_round(model),
         ),
         cost_search=cost,
         cost=cost,
@@ -129,6 +130,15 @@ def _assembled(
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
         notes=(*readings.notes, *_notes(readings)),
         version=__version__,
+    )
+
+
+def _turned_round(model: ErrorModel) -> tuple[str, ...]:
+    if not (np.diagonal(model.K) < 0).all():
+        return ()
+    return (
+        "All scale factors are negative: the reference, or the sensor, counts gravity instead of specific force, which "
+        "at rest points up.",
     )
 
 

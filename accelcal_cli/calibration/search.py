@@ -67,9 +67,13 @@ def search(problem: Loetters, settings: Settings) -> Solution:
         evaluations += int(polished.evaluations.sum())
         x, cost = polished.x, polished.cost
     best = int(np.nanargmin(cost))
-    floor = ROUNDING * problem.triangle.poses.max() * problem.g**4
-    agreeing = int((cost <= cost[best] * (1.0 + SAME_MINIMUM) + floor).sum())
+    agreeing = int((cost <= cost[best] * (1.0 + SAME_MINIMUM) + rounding(problem)).sum())
     return Solution(problem, x[best : best + 1], found, best, float(cost[best]), evaluations, agreeing)
+
+
+def rounding(problem: Loetters) -> float:
+    """Return the cost, (m/s^2)^4, below which only rounding is left."""
+    return float(ROUNDING * problem.triangle.poses.max() * problem.g**4)
 
 
 def polish(problem: Loetters, x: Float) -> Run:

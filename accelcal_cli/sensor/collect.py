@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.cells import Rows
 from accelcal_cli.sensor.columns import Columns
+from accelcal_cli.sensor.doubts import doubts
 from accelcal_cli.sensor.repeats import LabelledMeans
 from accelcal_cli.sensor.spool import IN_MEMORY, RowStore
 
@@ -91,14 +92,23 @@ class Collector:
         """Check the poses and return what came with them; `store` and `extent` then speak of poses."""
         extras = self._by_row() if self._means is None else self._by_label(self._means)
         if self.store.rows < 2:
-            count = "no readings" if not self.store.rows else "only one pose"
-            raise DataError(f"{self.source}: holds {count}; a calibration needs at least nine poses")
+            raise DataError(f"{self.source}: holds {self._few()}; a calibration needs at least nine poses")
         if self.extent.stuck:
             raise DataError(
                 f"{self.source}: all {self.store.rows:,} readings are equal, {self._value()}; "
                 "the sensor has to be turned between them"
             )
+        _, first = next(iter(self.store.blocks(LOOKED_AT)))
+        self.cautions += doubts(first, self.columns.names)
         return extras
+
+    def _few(self) -> str:
+        if not self.store.rows:
+            return "no readings"
+        if self._means is None or self.columns.label is None:
+            return "only one pose"
+        rows, column = int(self._means.rows.sum()), self.columns.label + 1
+        return f"only one pose, for column {column} gives all {rows:,} rows the same label"
 
     def _value(self) -> str:
         return "(" + ", ".join(f"{value:g}" for value in self.extent.lower) + ")"

@@ -121,3 +121,49 @@ def test_a_wrong_pose_among_very_many_is_named(size):
     force = G * poses.fibonacci(1500) + noise(1500, 1e-3, 2)
     force[700] *= size
     assert calibrate(Readings.from_array(DPSO.output(force)), FAST).outliers == (700,)
+
+
+@pytest.mark.parametrize(("iterations", "told"), [(1, True), (400, False)])
+def test_a_search_that_stopped_short_is_told(iterations, told):
+    settings = Settings(g=G, polish=False, parameters={"iterations": iterations})
+    for sigma in (0.0, 1e-3):
+        result = calibrate(readings(poses.turns(), sigma=sigma), settings)
+        assert any(_said(result, "stopped short of the minimum")) is told
+    polished = calibrate(readings(poses.turns(), sigma=1e-3), replace(settings, polish=True))
+    assert not any(_said(polished, "stopped short"))
+
+
+@pytest.mark.parametrize(
+    ("g", "told"), [(9.7803, False), (9.8322, False), (1.0, False), (98.0, True), (0.981, True)]
+)
+def test_a_gravity_that_is_none_is_told(g, told):
+    data = Readings.from_array(DPSO.output(G * poses.turns() + noise(24, 1e-3, 2)))
+    assert any(_said(calibrate(data, replace(FAST, g=g)), "neither gravity on Earth")) is told
+
+
+def test_a_reference_that_points_down_is_told():
+    u = poses.turns()
+    data = Readings.from_array(DPSO.output(G * u + noise(24, 1e-3, 2)), reference=-G * u)
+    assert any(_said(calibrate(data, Settings(g=G, attitudes="known")), "All scale factors are negative"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda rows: rows.__setitem__((slice(None), 2), 500.0), 'Column "3" is 500 in every pose'),
+        (
+            lambda rows: rows.__setitem__((slice(None), 2), rows[:, 0]),
+            'Columns "1" and "3" are equal in every pose',
+        ),
+        (
+            lambda rows: rows.__setitem__(slice(8), rows[16:]),
+            "8 of 24 poses repeat another to the last digit",
+        ),
+        (lambda rows: rows.__setitem__(slice(7), rows[17:]), None),
+    ],
+)
+def test_dead_and_doubled_axes_and_copies_are_told(spoil, words):
+    rows = DPSO.output(G * poses.turns() + noise(24, 1e-3, 2))
+    spoil(rows)
+    told = Readings.from_array(rows).cautions
+    assert [words in caution for caution in told] == [True] if words else told == ()
