@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import IO
 
@@ -22,6 +21,9 @@ from accelcal_cli.streams import Float
 
 UNITS = {"m/s^2": 1.0, "g": 1.0 / STANDARD_GRAVITY, "mg": 1000.0 / STANDARD_GRAVITY}
 """Units of the specific force, and how many of each are 1 m/s^2."""
+
+LOOKED_AT, USUAL = 10_000, (0.5, 2.0)
+"""Readings at the start of a log whose median specific force is looked at, and the multiples of g it usually is."""
 
 TILT = ("roll", "pitch", "sigma_roll", "sigma_pitch")
 
@@ -61,18 +63,51 @@ class Wish:
         return (*(self.prefix + axis for axis in AXES), *(TILT if self.tilt else ()))
 
 
+class Formula:
+    """New columns from readings, and what the first of them looked like."""
+
+    def __init__(self, result: Calibration, wish: Wish) -> None:
+        """Take over the model, the temperature slopes and what is wished for."""
+        own = "g" if result.unit == "g" else "m/s^2"
+        self.g, self.factor = result.g, UNITS[wish.unit or own] / UNITS[own]
+        self.model, self.warmth = result.model, result.temperature
+        self.tilt = Tilt.of(result, wish.noise) if wish.tilt else None
+        self.first: float | None = None
+
+    def __call__(self, numbers: Float) -> Float:
+        """Return the new columns, shape (B, k), of output, shape (B, 3), or with temperature, shape (B, 4)."""
+        output = numbers[:, :3]
+        if self.warmth is not None and numbers.shape[1] > 3:
+            output = self.warmth.at_reference(output, numbers[:, 3], self.model.D)
+        force = self.model.specific_force(output)
+        if self.first is None and len(force):
+            self.first = float(np.median(np.linalg.norm(force[:LOOKED_AT], axis=1))) / self.g
+        scaled = force if self.factor == 1.0 else force * self.factor
+        return scaled if self.tilt is None else np.concatenate([scaled, self.tilt.columns(force)], axis=1)
+
+    def cautions(self) -> tuple[str, ...]:
+        """Return what the first readings say against the result, in sentences, once they have come."""
+        if self.first is None or USUAL[0] <= self.first <= USUAL[1]:
+            return ()
+        return (
+            f"The first readings come out as {self.first:.3g} g (median): are they in the unit of those that were "
+            "calibrated?",
+        )
+
+
 @dataclass(frozen=True)
 class Log:
     """A log and what is to become of it.
 
     Attributes:
         table: the log, open and not read yet.
-        change: the new columns.
+        change: the new columns; formula: what they are made by.
         notes: what a user should know.
     """
 
     table: Table
     change: Change
+    formula: Formula
     notes: tuple[str, ...]
 
     @property
@@ -117,8 +152,9 @@ def prepare(result: Calibration, table: Table, wanted: list[str] | None, wish: W
         raise DataError(f'{table.name}: has a column "{taken[0]}" already; choose another --prefix')
     warm = () if result.temperature is None or columns.temperature is None else (columns.temperature,)
     places = columns.output if wish.replace else ()
-    change = Change(Selection((*columns.output, *warm)), _formula(result, wish), wish.names, places)
-    return Log(table, change, _notes(columns, result, used=bool(warm)))
+    formula = Formula(result, wish)
+    change = Change(Selection((*columns.output, *warm)), formula, wish.names, places)
+    return Log(table, change, formula, _notes(columns, result, used=bool(warm)))
 
 
 def _notes(columns: Columns, result: Calibration, *, used: bool) -> tuple[str, ...]:
@@ -127,21 +163,3 @@ def _notes(columns: Columns, result: Calibration, *, used: bool) -> tuple[str, .
         held = result.temperature.reference
         notes.append(f"the log has no temperature column: its readings are taken to be at {held:.4g} degrees")
     return tuple(notes)
-
-
-def _formula(result: Calibration, wish: Wish) -> Callable[[Float], Float]:
-    """Return the function from output, shape (B, 3), or with temperature, (B, 4), to the new columns, shape (B, k)."""
-    own = "g" if result.unit == "g" else "m/s^2"
-    factor = UNITS[wish.unit or own] / UNITS[own]
-    model, warmth = result.model, result.temperature
-    tilt = Tilt.of(result, wish.noise) if wish.tilt else None
-
-    def compute(numbers: Float) -> Float:
-        output = numbers[:, :3]
-        if warmth is not None and numbers.shape[1] > 3:
-            output = warmth.at_reference(output, numbers[:, 3], model.D)
-        force = model.specific_force(output)
-        scaled = force if factor == 1.0 else force * factor
-        return scaled if tilt is None else np.concatenate([scaled, tilt.columns(force)], axis=1)
-
-    return compute

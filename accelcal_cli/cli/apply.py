@@ -70,6 +70,7 @@ def command(
     finally:
         table.close()
     sys.stdout.flush()
+    options.caution(data, log.formula.cautions(), quiet)
     if not quiet:
         notes = (*log.notes, *([] if output == "-" else [f"wrote {output}"]))
         for note in notes:

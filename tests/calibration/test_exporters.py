@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import shutil
@@ -106,6 +107,19 @@ def test_counts_need_the_scale_of_the_driver(counts, name):
     raw = READING * 415.0
     force = autopilot(values, offset, scale, raw / 417.7)
     np.testing.assert_allclose(force, diagonal(counts.K_a, counts.D_a, raw), rtol=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+@pytest.mark.parametrize("driver_scale", [1.0, 9.81, 4150.0])
+def test_a_driver_scale_of_other_readings_is_refused(counts, name, driver_scale):
+    with pytest.raises(UsageError, match=f"--driver-scale {driver_scale:g}: the calibrated readings are 41"):
+        export(counts, name, Target(driver_scale=driver_scale))
+
+
+def test_cautions_stand_in_the_comments(metres):
+    doubtful = dataclasses.replace(metres, cautions=("The sensor moved.",))
+    for name in ("px4", "ardupilot", "kalibr", "ros", "c-header"):
+        assert "caution: The sensor moved." in text(export(doubtful, name, Target()))
 
 
 def test_the_symmetric_gauge_halves_what_an_autopilot_drops(metres):

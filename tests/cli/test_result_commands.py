@@ -137,6 +137,16 @@ def test_a_result_in_g_gives_g_unless_told(run, good, log):
     np.testing.assert_allclose(metres, own * 9.80665, rtol=1e-14)
 
 
+def test_a_log_in_another_unit_is_told(run, result, log):
+    """The result is of counts; the log is in g."""
+    rows = [line.split(",") for line in Path(log).read_text().splitlines()]
+    in_g = [[row[0], *(f"{float(cell) / 4000:.6f}" for cell in row[1:4]), *row[4:]] for row in rows[1:]]
+    Path("in_g.csv").write_text("\n".join(",".join(row) for row in [rows[0], *in_g]) + "\n")
+    told = run("apply", result, "in_g.csv", "-o", "out.csv").err
+    assert told.startswith("accelcal: in_g.csv: caution: The first readings come out as ")
+    assert run("apply", result, "in_g.csv", "-o", "out.csv", "-q").err == ""
+
+
 def test_through_a_pipe(run, result, log):
     direct = run("apply", result, log, "-q").out
     assert run("apply", result, "-", "-q", stdin=Path(log).read_bytes()).out == direct

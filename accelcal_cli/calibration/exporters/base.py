@@ -49,6 +49,7 @@ def origin(result: Calibration) -> list[str]:
         f"accelcal {result.version}, verdict {result.verdict}, {result.poses} poses, g = {result.g:.9g} {result.unit}, "
         f"gauge {result.gauge}",
         f"readings {result.data.get('source', '?')}, sha256 {result.data.get('sha256', '?')}",
+        *(f"caution: {caution}" for caution in result.cautions),
     ]
     return [" ".join(line.split()) for line in lines]
 
@@ -75,16 +76,23 @@ def in_metres(result: Calibration, target: Target, name: str) -> ErrorModel:
     Readings in g are multiplied by 9.80665 on both sides; others by what the driver makes of them.
 
     Raises:
-        UsageError: the readings are neither, and no driver scale says what the target makes of them.
+        UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver scale
+            that is not that of these readings.
     """
     metres = STANDARD_GRAVITY if result.unit == "g" else 1.0  # how much one unit of f is in m/s^2
+    scale = np.diagonal(result.K_a) / metres
     if target.driver_scale is not None:
+        near = scale / target.driver_scale
+        if not (NEAR_ONE[0] < near.min() and near.max() < NEAR_ONE[1]):
+            raise UsageError(
+                f"--driver-scale {target.driver_scale:g}: the calibrated readings are {scale.mean():.6g} to 1 m/s^2; "
+                f"expected a number within a factor of {NEAR_ONE[1]:g} of it"
+            )
         return ErrorModel(result.K_a / metres / target.driver_scale, result.D_a / target.driver_scale)
     if not force_already(result):
-        scale = np.diagonal(result.K_a)
         raise UsageError(
             f"--to {name}: corrects readings in m/s^2, and these are in output units, {scale.mean():.6g} of them to "
-            f"1 {result.unit}; state with --driver-scale how many the driver takes for 1 m/s^2"
+            f"1 m/s^2; state with --driver-scale how many the driver takes for 1 m/s^2"
         )
     return ErrorModel(result.K_a, result.D_a * metres)
 
