@@ -19,6 +19,7 @@ from accelcal_cli.table import Column, Table
 COLUMNS = (
     Column("filter"),
     Column("mode"),
+    Column("accelerometer", "micro-g", ".3g", key="accelerometer_ug"),
     Column("runs", format="d"),
     Column("position", "m", ".1f", key="rmse_position_m"),
     Column("latitude", "m", ".1f", key="rmse_latitude_m"),
@@ -33,7 +34,6 @@ COLUMNS = (
     Column("look-ups", "1/epoch", ".0f", key="lookups"),
     Column("time", "s", ".1f", key="seconds"),
     Column("epoch", "us", ".0f", key="epoch_us"),
-    Column("accelerometer", "micro-g", ".3g", key="accelerometer_ug"),
 )
 
 
@@ -70,6 +70,7 @@ def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) 
     return (
         entry.label,
         study.names(cell)["mode"],
+        grade.accelerometer,
         len(records),
         *(position, float(np.sqrt(north)), float(np.sqrt(east)), _circular(records)),
         *(least, position / least, float(np.sqrt(ins))),
@@ -77,7 +78,6 @@ def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) 
         sum(record.status == "diverged" for record in records),
         *(nees, lookups, seconds),
         1e6 * seconds / sum(record.iterations for record in records),
-        grade.accelerometer,
     )
 
 
