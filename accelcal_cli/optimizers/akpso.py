@@ -35,7 +35,7 @@ class KalmanState(State):
 @OPTIMIZERS.register("akpso")
 @dataclass(frozen=True)
 class AdaptiveKalmanSwarm(Optimizer):
-    """AKPSO with the settings of the paper."""
+    """AKPSO with the constants of the paper, its filter in two states; `kalman_dim: 4` is the printed one."""
 
     family = "swarm"
     paper = "akpso2015"

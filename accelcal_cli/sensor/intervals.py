@@ -18,8 +18,8 @@ Ints = NDArray[np.int64]
 Moments = tuple[Floats, Floats, Floats]
 
 STEADY = 0.04
-"""Halves of a pose have means that differ by less than this part of the range of the readings, about 1 g: 2.3 degrees,
-or 5 degrees turned from end to end."""
+"""Halves of a pose have means that differ by less than this part of half the range of the readings, about 1 g: 2.3
+degrees, or 5 degrees turned from end to end."""
 
 BEYOND_NOISE = 5.0
 """Sigmas that halves have to differ by before it is no longer noise, or the beat of a vibration."""
