@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.errors import DataError, Interrupted, UsageError
+from accelcal_cli.cli import options, signals
+from accelcal_cli.errors import AccelcalError, Interrupted, OutputError, UsageError
 
 if TYPE_CHECKING:
+    from accelcal_cli.output.capture import PoseFile
+    from accelcal_cli.output.live import Watch
     from accelcal_cli.sensor.capture import Capture
     from accelcal_cli.streams import Float
 
@@ -60,9 +62,9 @@ def command(
     """Take poses from a live sensor, guided.
 
     Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged;
-    when all are there, one row a pose is written, for accelcal calibrate. Ctrl-C, the end of the input and a lost
-    port end it early; the poses taken until then are written. Exit code 1 means that the input ended before all
-    poses were taken.
+    each is one row of the table for accelcal calibrate, written when it is taken. Ctrl-C, a closed terminal, the end
+    of the input and a lost port end it early; the poses taken until then are there. Exit code 1 means that the input
+    ended before all poses were taken.
     """
     from accelcal_cli.calibration.planner import FIXTURES
     from accelcal_cli.output.files import check_target
@@ -82,7 +84,8 @@ def command(
     check_target(output)
     options.check_input(port)
     capture = _capture(poses, fixture, round(window * rate), round(hold * rate), (still, scale, centre))
-    _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
+    with signals.raised():
+        _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
 
 
 def _columns(text: str) -> list[int]:
@@ -142,44 +145,51 @@ def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Itera
 
 
 def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) -> None:
-    """Watch the readings to the end, whatever it is; write what was taken; then say how it ended."""
+    """Watch the readings to the end, whatever it is, and keep the poses; then say how it ended."""
+    from accelcal_cli.output.capture import PoseFile
     from accelcal_cli.output.live import Watch
 
-    ending: Exception | None = None
-    try:
-        with Watch(capture, quiet=quiet) as watch:
-            for reading in readings:
-                status = capture.push(reading)
-                if status is not None:
-                    watch.see(status)
-                if status is not None and status.state == "taken" and not capture.missing():
-                    break
-    except KeyboardInterrupt:
-        ending = Interrupted("interrupted")
-    except DataError as error:
-        ending = error
-    kept = _write(capture, output)
+    ending: AccelcalError | Interrupted | None = None
+    with PoseFile(output) as file:
+        try:
+            with Watch(capture, quiet=quiet) as watch:
+                _take(capture, readings, file, watch)
+        except KeyboardInterrupt as stop:
+            ending = signals.interrupted(stop)
+        except AccelcalError as error:
+            ending = error
+        try:
+            file.save(capture.taken, last=True)
+        except OutputError as error:
+            ending = error
+    kept = _kept(capture, file)
     if ending is not None:
-        raise type(ending)(f"{ending}; {kept}")
+        ending.args = (f"{ending}; {kept}",)
+        raise ending
     if not quiet:
         typer.echo(f"accelcal: {kept}", err=True)
     if capture.missing():
         raise typer.Exit(INCOMPLETE)
 
 
-def _write(capture: Capture, output: str) -> str:
-    """Write one row a pose, whole or not at all; return what to say of it."""
-    from accelcal_cli.output.files import whole_file
+def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Watch) -> None:
+    """Keep every pose when it is taken, before it is shown, until all are there or the readings end."""
+    for reading in readings:
+        status = capture.push(reading)
+        if status is None:
+            continue
+        if status.state == "taken":
+            file.save(capture.taken)
+        watch.see(status)
+        if status.state == "taken" and not capture.missing():
+            return
 
-    if not capture.taken:
-        return "no pose was taken, nothing is written"
-    with whole_file(output) as file:
-        file.write("pose,n,Nx,Ny,Nz,sx,sy,sz\n")
-        for number, pose in enumerate(capture.taken, 1):
-            cells = [repr(float(v)) for v in (*pose.mean, *pose.spread)]
-            file.write(",".join([str(number), str(pose.n), *cells]) + "\n")
-        file.flush()
-    where = "" if output == "-" else f" in {output}"
+
+def _kept(capture: Capture, file: PoseFile) -> str:
+    """Return what to say of the poses that are written."""
+    if not file.kept:
+        return "nothing is written" if capture.taken else "no pose was taken, nothing is written"
+    where = "" if file.path == "-" else f" in {file.path}"
     missing = len(capture.missing())
     rest = f", {missing} planned are missing" if missing else ""
-    return f"{len(capture.taken)} pose{'s' * (len(capture.taken) != 1)}{where}{rest}"
+    return f"{file.kept} pose{'s' * (file.kept != 1)}{where}{rest}"

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from accelcal_cli.calibration.planner import candidates, distinct_poses
+from accelcal_cli.errors import OutputError
+from accelcal_cli.output import capture
 from accelcal_cli.streams import Streams
 
 FAST = ("--port", "-", "--rate", "20", "--window", "1", "--hold", "2")
@@ -50,6 +52,49 @@ def test_an_input_without_a_pose_leaves_no_file(run, tmp_path):
     assert done.code == 1
     assert "no pose was taken, nothing is written" in done.err
     assert not (tmp_path / "poses.csv").exists()
+
+
+@pytest.mark.parametrize("output", ["/proc/poses.csv", "/dev/full"])
+def test_an_output_that_cannot_be_written_is_told_before_the_first_pose(run, output):
+    done = run("capture", *FAST, "-o", output, stdin=stream(12))
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith(f"accelcal: {output}: ")
+    assert done.err.count("\n") == 1
+
+
+def test_standard_output_that_is_full_is_told_before_the_first_pose(shell, tmp_path):
+    (tmp_path / "log").write_bytes(stream(12))
+    done = shell(f"accelcal capture {' '.join(FAST)} < log > /dev/full")
+    assert (done.code, done.err) == (2, "accelcal: cannot write: no space left on device\n")
+
+
+@pytest.mark.parametrize("there", [0, 3])
+def test_a_disk_that_fills_up_leaves_the_poses_before(run, tmp_path, monkeypatch, there):
+    real, saved = capture.whole_file, []
+
+    def filling(path):
+        saved.append(path)
+        if len(saved) > there:
+            raise OutputError(f"{path}: cannot be written: no space left on device")
+        return real(path)
+
+    monkeypatch.setattr(capture, "whole_file", filling)
+    done = run("capture", *FAST, "-o", "poses.csv", stdin=stream(12))
+    assert done.code == 2
+    kept = "3 poses in poses.csv, 8 planned are missing" if there else "nothing is written"
+    said = "accelcal: poses.csv: cannot be written: no space left on device; "
+    assert done.err.splitlines()[-1] == said + kept
+    assert [len(path.read_text("utf-8").splitlines()) for path in tmp_path.iterdir()] == [there + 1] * (
+        there > 0
+    )
+
+
+def test_a_pipe_by_name_gets_a_row_a_pose(shell, tmp_path):
+    (tmp_path / "log").write_bytes(stream(12))
+    done = shell(f"mkfifo pipe; cat pipe & accelcal capture {' '.join(FAST)} -q -o pipe < log; wait")
+    assert (done.code, done.err) == (0, "")
+    assert done.out == shell(f"accelcal capture {' '.join(FAST)} -q < log").out
+    assert done.out.count("\n") == 13
 
 
 def test_the_unit_and_the_offset_may_be_stated(run):
