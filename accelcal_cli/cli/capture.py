@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -57,6 +58,9 @@ def command(
     ] = None,
     timeout: Annotated[float, typer.Option(help="Longest silence of the port, seconds.")] = 10.0,
     output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Let the poses take the place of a file that exists.")
+    ] = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Take poses from a live sensor, guided.
@@ -81,6 +85,9 @@ def command(
             f"--window {window:g}, --hold {hold:g}, --rate {rate:g}: expected 2 to {MOST_READINGS:,} readings"
         )
     scale, centre = _unit(unit), _offset(offset)
+    options.check_apart([port], {"-o": output})
+    if Path(output).is_file() and not overwrite:
+        raise UsageError(f'-o "{output}": exists already; expected a new name, or --overwrite')
     check_target(output)
     options.check_input(port)
     capture = _capture(poses, fixture, round(window * rate), round(hold * rate), (still, scale, centre))

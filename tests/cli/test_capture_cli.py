@@ -54,6 +54,23 @@ def test_an_input_without_a_pose_leaves_no_file(run, tmp_path):
     assert not (tmp_path / "poses.csv").exists()
 
 
+def test_an_earlier_session_is_replaced_only_on_request(run, tmp_path):
+    (tmp_path / "poses.csv").write_text("an earlier session\n")
+    done = run("capture", *FAST, "-o", "poses.csv", stdin=stream(12))
+    said = 'accelcal: -o "poses.csv": exists already; expected a new name, or --overwrite\n'
+    assert (done.code, done.out, done.err) == (2, "", said)
+    assert run("capture", *FAST, "--overwrite", "-o", "poses.csv", stdin=stream(1, still=10)).code == 1
+    assert (tmp_path / "poses.csv").read_text() == "an earlier session\n"
+    assert run("capture", *FAST, "--overwrite", "-o", "poses.csv", stdin=stream(12)).code == 0
+    assert len((tmp_path / "poses.csv").read_text("utf-8").splitlines()) == 13
+
+
+def test_the_log_itself_is_not_replaced_even_on_request(shell, tmp_path):
+    (tmp_path / "log").write_bytes(stream(12))
+    done = shell(f"accelcal capture {' '.join(FAST)} --overwrite -o log < log")
+    assert (done.code, done.err) == (2, 'accelcal: -o "log": is the input itself; expected another name\n')
+
+
 @pytest.mark.parametrize("output", ["/proc/poses.csv", "/dev/full"])
 def test_an_output_that_cannot_be_written_is_told_before_the_first_pose(run, output):
     done = run("capture", *FAST, "-o", output, stdin=stream(12))
