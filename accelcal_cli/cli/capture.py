@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from accelcal_cli.streams import Float
 
 MOST_READINGS = 1_000_000
-UNITS = {"g": 1.0, "m/s2": 9.80665}
 INCOMPLETE = 1
 
 
@@ -47,7 +46,9 @@ def command(
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(help="Output of 1 g: g, m/s2, or a number.", show_default="estimated from the poses"),
+        typer.Option(
+            help="Output of 1 g: g, mg, m/s^2, or a number.", show_default="estimated from the poses"
+        ),
     ] = None,
     offset: Annotated[
         str | None,
@@ -84,13 +85,13 @@ def command(
         raise UsageError(
             f"--window {window:g}, --hold {hold:g}, --rate {rate:g}: expected 2 to {MOST_READINGS:,} readings"
         )
-    scale, centre = _unit(unit), _offset(offset)
+    stated = still, _unit(unit), _offset(offset)
     options.check_apart([port], {"-o": output})
     if Path(output).is_file() and not overwrite:
         raise UsageError(f'-o "{output}": exists already; expected a new name, or --overwrite')
     check_target(output)
     options.check_input(port)
-    capture = _capture(poses, fixture, round(window * rate), round(hold * rate), (still, scale, centre))
+    capture = _capture(poses, fixture, round(window * rate), round(hold * rate), stated, unit)
     with signals.raised():
         _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
 
@@ -109,12 +110,14 @@ def _columns(text: str) -> list[int]:
 def _unit(text: str | None) -> float | None:
     if text is None:
         return None
+    from accelcal_cli.sensor.units import OUTPUT_OF_1_G
+
     try:
-        size = UNITS.get(text) or float(text)
+        size = OUTPUT_OF_1_G.get(text) or float(text)
     except ValueError:
         size = math.nan
     if not (math.isfinite(size) and size > 0):
-        raise UsageError(f'--unit "{text}": expected g, m/s2 or a positive number, the output of 1 g')
+        raise UsageError(f'--unit "{text}": expected g, mg, m/s^2 or a positive number, the output of 1 g')
     return size
 
 
@@ -133,15 +136,27 @@ def _offset(text: str | None) -> Float | None:
 
 
 def _capture(
-    poses: int, fixture: str, window: int, hold: int, stated: tuple[float | None, float | None, Float | None]
+    poses: int,
+    fixture: str,
+    window: int,
+    hold: int,
+    stated: tuple[float | None, float | None, Float | None],
+    unit: str | None,
 ) -> Capture:
     from accelcal_cli.calibration.planner import candidates, distinct_poses
     from accelcal_cli.sensor.capture import Capture
+    from accelcal_cli.sensor.units import OUTPUT_OF_1_G
 
     allowed = candidates(fixture)
     if poses > len(allowed):
         raise UsageError(f"--poses {poses}: expected at most {len(allowed)} with --fixture {fixture}")
-    return Capture(allowed[distinct_poses(allowed, poses)], window, hold, *stated)
+    return Capture(
+        allowed[distinct_poses(allowed, poses)],
+        window,
+        hold,
+        *stated,
+        unit if unit in OUTPUT_OF_1_G else None,
+    )
 
 
 def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Iterator[Float]:
@@ -195,7 +210,8 @@ def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Wa
 def _kept(capture: Capture, file: PoseFile) -> str:
     """Return what to say of the poses that are written."""
     if not file.kept:
-        return "nothing is written" if capture.taken else "no pose was taken, nothing is written"
+        parts = ["no pose was taken"] * (not capture.taken) + ["nothing is written"] * (not file.flows)
+        return ", ".join(parts) or "no pose is written"
     where = "" if file.path == "-" else f" in {file.path}"
     missing = len(capture.missing())
     rest = f", {missing} planned are missing" if missing else ""

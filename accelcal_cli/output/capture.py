@@ -24,6 +24,7 @@ class PoseFile:
 
     Attributes:
         kept: poses that are written.
+        flows: it is a pipe or a device, which has the names of the columns before there is a pose.
     """
 
     def __init__(self, path: str) -> None:
@@ -31,8 +32,8 @@ class PoseFile:
         self.path, self.kept = path, 0
         check_target(path)
         self._stream = self._opened()
-        self._live = self._stream is not None and not self._stream.isatty()
-        if self._live:
+        self.flows = self._stream is not None and not self._stream.isatty()
+        if self.flows:
             try:
                 self._send([HEADER])
             except BaseException:
@@ -61,7 +62,7 @@ class PoseFile:
         if self._stream is None:
             with whole_file(self.path) as file:
                 file.writelines([HEADER, *rows])
-        elif self._live:
+        elif self.flows:
             self._send(rows[self.kept :])
         elif last:
             self._send([HEADER, *rows])

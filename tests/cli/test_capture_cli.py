@@ -123,6 +123,54 @@ def test_the_unit_and_the_offset_may_be_stated(run):
 
 
 @pytest.mark.parametrize(
+    ("reading", "options", "said"),
+    [
+        (
+            "0 0 0",
+            ("m/s2",),
+            "reads 0, 0, 0, length 0; expected 4.903 to 19.61, about 1 g with --unit m/s2; are --unit",
+        ),
+        ("1000 0 0", ("g",), "length 1000; expected 0.5 to 2, about 1 g with --unit g; state --unit mg;"),
+        (
+            "0 0.6 0.8",
+            ("m/s^2",),
+            "length 1; expected 4.903 to 19.61, about 1 g with --unit m/s^2; state --unit g;",
+        ),
+        (
+            "0 0 -9.8",
+            ("mg",),
+            "length 9.8; expected 500 to 2000, about 1 g with --unit mg; state --unit m/s^2;",
+        ),
+        ("5 0 1", ("g", "--offset", "-5,0,0"), "reads 10, 0, 1, length 10.05;"),
+    ],
+)
+def test_a_first_pose_that_is_not_1_g_in_the_stated_unit_is_refused(run, tmp_path, reading, options, said):
+    stdin = f"{reading}\n".encode() * 60
+    done = run("capture", *FAST, "-q", "-o", "poses.csv", "--unit", *options, stdin=stdin)
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
+    assert done.err.endswith("no pose was taken, nothing is written\n")
+    assert done.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("reading", "options"),
+    [
+        ("0 0 -0.6", ("g",)),
+        ("0 0 1900", ("mg",)),
+        ("5 0 1", ("g", "--offset", "5,0,0")),
+        ("0 0 30000", ("16384",)),  # counts may have any bias
+        ("0 0 60000", ("16384",)),
+    ],
+)
+def test_a_first_pose_may_miss_1_g_by_much_and_counts_by_anything(run, reading, options):
+    done = run("capture", *FAST, "-q", "--unit", *options, stdin=f"{reading}\n".encode() * 60)
+    assert (done.code, done.err) == (1, "")
+    assert done.out.count("\n") == 2
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ((), "--port"),
@@ -142,7 +190,7 @@ def test_the_unit_and_the_offset_may_be_stated(run):
         (("--port", "-", "--still", "-1"), "--still -1: expected a positive number"),
         (("--port", "-", "--timeout", "0"), "--timeout 0: expected a positive number"),
         (("--port", "-", "--baud", "3"), "--baud"),
-        (("--port", "-", "--unit", "ft"), '--unit "ft": expected g, m/s2 or a positive number'),
+        (("--port", "-", "--unit", "ft"), '--unit "ft": expected g, mg, m/s^2 or a positive number'),
         (("--port", "-", "--unit", "0"), '--unit "0"'),
         (("--port", "-", "--offset", "1,2"), '--offset "1,2": expected three numbers'),
         (("--port", "-", "-o", "no/poses.csv"), "no such folder"),
