@@ -31,7 +31,15 @@ class OutputError(AccelcalError):
 
 
 class Interrupted(Exception):  # noqa: N818  # it is none
-    """Work was interrupted from the keyboard; the message says what is kept and how to go on."""
+    """Work was interrupted, from the keyboard or by a signal; the message says what is kept and how to go on.
+
+    `code` is the exit code.
+    """
+
+    def __init__(self, message: str, code: int = 130) -> None:
+        """Say what is kept."""
+        super().__init__(message)
+        self.code = code
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -114,13 +114,14 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     rate = settings.rate if settings.rate is not None else log.clock.rate
     rows = settings.spans.rows(rate)
     envelope = Envelope(rows.tile) if picture else None
-    tiles = read_tiles(log, rows.tile, envelope)
+    tiles = read_tiles(log, rows, envelope)
     level = find_level(tiles, rows, log.name)
     found = find_intervals(tiles, rows, level, settings.multipliers)
     candidates = tuple(judge(f, settings.g) for f in found)
     enough = [k for k, c in enumerate(candidates) if c.attitudes >= settings.least_poses]
     kept = best(enough, candidates) if enough else nearest(found, candidates)
     intervals = found[kept].intervals
+    gaps = tiles.gaps.notes(log.clock.unit)
     detection = Detection(
         source=log.name,
         sha256=log.sha256,
@@ -133,12 +134,12 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         candidates=candidates,
         intervals=_thinned(intervals, settings) if enough else intervals,
         settings=settings,
-        notes=tuple(log.notes),
+        notes=(*log.notes, *gaps),
         envelope=envelope,
     )
     if not enough:
         why = too_few(found, candidates, level, rows, settings.least_poses)
-        raise TooFewPosesError(f"{log.name}: {why}", detection)
+        raise TooFewPosesError("; ".join([f"{log.name}: {why}", *gaps]), detection)
     return detection
 
 

@@ -54,6 +54,7 @@ def command(
     from accelcal_cli.sensor.tabular import open_table
 
     options.check_input(data)
+    options.check_apart([result], {"-o": output})  # the log itself may be the output
     check_target(output)
     wish = Wish(unit, replace, prefix, tilt, noise)
     calibration = options.load_result(result, data)

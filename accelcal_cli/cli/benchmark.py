@@ -75,6 +75,7 @@ def command(
     from accelcal_cli.studies.functions import select
 
     options.check_format(format)
+    options.check_apart([config], {"--raw": raw, "--plot": plot})
     running.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")

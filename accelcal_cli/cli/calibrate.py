@@ -96,6 +96,7 @@ def command(
 
     options.check_format(format)
     options.check_input(data)
+    options.check_apart([data, config], {"-o": output})
     _check_output(output, format)
     options.check_tolerance(tolerance)
     stated_g = options.gravity(g, latitude, height)

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.errors import DataError, Interrupted, UsageError
+from accelcal_cli.cli import options, signals
+from accelcal_cli.errors import AccelcalError, Interrupted, OutputError, UsageError
 
 if TYPE_CHECKING:
+    from accelcal_cli.output.capture import PoseFile
+    from accelcal_cli.output.live import Watch
     from accelcal_cli.sensor.capture import Capture
     from accelcal_cli.streams import Float
 
 MOST_READINGS = 1_000_000
-UNITS = {"g": 1.0, "m/s2": 9.80665}
 INCOMPLETE = 1
 
 
@@ -44,7 +46,9 @@ def command(
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(help="Output of 1 g: g, m/s2, or a number.", show_default="estimated from the poses"),
+        typer.Option(
+            help="Output of 1 g: g, mg, m/s^2, or a number.", show_default="estimated from the poses"
+        ),
     ] = None,
     offset: Annotated[
         str | None,
@@ -55,14 +59,17 @@ def command(
     ] = None,
     timeout: Annotated[float, typer.Option(help="Longest silence of the port, seconds.")] = 10.0,
     output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Let the poses take the place of a file that exists.")
+    ] = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Take poses from a live sensor, guided.
 
     Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged;
-    when all are there, one row a pose is written, for accelcal calibrate. Ctrl-C, the end of the input and a lost
-    port end it early; the poses taken until then are written. Exit code 1 means that the input ended before all
-    poses were taken.
+    each is one row of the table for accelcal calibrate, written when it is taken. Ctrl-C, a closed terminal, the end
+    of the input and a lost port end it early; the poses taken until then are there. Exit code 1 means that the input
+    ended before all poses were taken.
     """
     from accelcal_cli.calibration.planner import FIXTURES
     from accelcal_cli.output.files import check_target
@@ -78,11 +85,15 @@ def command(
         raise UsageError(
             f"--window {window:g}, --hold {hold:g}, --rate {rate:g}: expected 2 to {MOST_READINGS:,} readings"
         )
-    scale, centre = _unit(unit), _offset(offset)
+    stated = still, _unit(unit), _offset(offset)
+    options.check_apart([port], {"-o": output})
+    if Path(output).is_file() and not overwrite:
+        raise UsageError(f'-o "{output}": exists already; expected a new name, or --overwrite')
     check_target(output)
     options.check_input(port)
-    capture = _capture(poses, fixture, round(window * rate), round(hold * rate), (still, scale, centre))
-    _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
+    capture = _capture(poses, fixture, round(window * rate), round(hold * rate), stated, unit)
+    with signals.raised():
+        _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
 
 
 def _columns(text: str) -> list[int]:
@@ -99,12 +110,14 @@ def _columns(text: str) -> list[int]:
 def _unit(text: str | None) -> float | None:
     if text is None:
         return None
+    from accelcal_cli.sensor.units import OUTPUT_OF_1_G
+
     try:
-        size = UNITS.get(text) or float(text)
+        size = OUTPUT_OF_1_G.get(text) or float(text)
     except ValueError:
         size = math.nan
     if not (math.isfinite(size) and size > 0):
-        raise UsageError(f'--unit "{text}": expected g, m/s2 or a positive number, the output of 1 g')
+        raise UsageError(f'--unit "{text}": expected g, mg, m/s^2 or a positive number, the output of 1 g')
     return size
 
 
@@ -123,15 +136,27 @@ def _offset(text: str | None) -> Float | None:
 
 
 def _capture(
-    poses: int, fixture: str, window: int, hold: int, stated: tuple[float | None, float | None, Float | None]
+    poses: int,
+    fixture: str,
+    window: int,
+    hold: int,
+    stated: tuple[float | None, float | None, Float | None],
+    unit: str | None,
 ) -> Capture:
     from accelcal_cli.calibration.planner import candidates, distinct_poses
     from accelcal_cli.sensor.capture import Capture
+    from accelcal_cli.sensor.units import OUTPUT_OF_1_G
 
     allowed = candidates(fixture)
     if poses > len(allowed):
         raise UsageError(f"--poses {poses}: expected at most {len(allowed)} with --fixture {fixture}")
-    return Capture(allowed[distinct_poses(allowed, poses)], window, hold, *stated)
+    return Capture(
+        allowed[distinct_poses(allowed, poses)],
+        window,
+        hold,
+        *stated,
+        unit if unit in OUTPUT_OF_1_G else None,
+    )
 
 
 def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Iterator[Float]:
@@ -142,44 +167,52 @@ def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Itera
 
 
 def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) -> None:
-    """Watch the readings to the end, whatever it is; write what was taken; then say how it ended."""
+    """Watch the readings to the end, whatever it is, and keep the poses; then say how it ended."""
+    from accelcal_cli.output.capture import PoseFile
     from accelcal_cli.output.live import Watch
 
-    ending: Exception | None = None
-    try:
-        with Watch(capture, quiet=quiet) as watch:
-            for reading in readings:
-                status = capture.push(reading)
-                if status is not None:
-                    watch.see(status)
-                if status is not None and status.state == "taken" and not capture.missing():
-                    break
-    except KeyboardInterrupt:
-        ending = Interrupted("interrupted")
-    except DataError as error:
-        ending = error
-    kept = _write(capture, output)
+    ending: AccelcalError | Interrupted | None = None
+    with PoseFile(output) as file:
+        try:
+            with Watch(capture, quiet=quiet) as watch:
+                _take(capture, readings, file, watch)
+        except KeyboardInterrupt as stop:
+            ending = signals.interrupted(stop)
+        except AccelcalError as error:
+            ending = error
+        try:
+            file.save(capture.taken, last=True)
+        except OutputError as error:
+            ending = error
+    kept = _kept(capture, file)
     if ending is not None:
-        raise type(ending)(f"{ending}; {kept}")
+        ending.args = (f"{ending}; {kept}",)
+        raise ending
     if not quiet:
         typer.echo(f"accelcal: {kept}", err=True)
     if capture.missing():
         raise typer.Exit(INCOMPLETE)
 
 
-def _write(capture: Capture, output: str) -> str:
-    """Write one row a pose, whole or not at all; return what to say of it."""
-    from accelcal_cli.output.files import whole_file
+def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Watch) -> None:
+    """Keep every pose when it is taken, before it is shown, until all are there or the readings end."""
+    for reading in readings:
+        status = capture.push(reading)
+        if status is None:
+            continue
+        if status.state == "taken":
+            file.save(capture.taken)
+        watch.see(status)
+        if status.state == "taken" and not capture.missing():
+            return
 
-    if not capture.taken:
-        return "no pose was taken, nothing is written"
-    with whole_file(output) as file:
-        file.write("pose,n,Nx,Ny,Nz,sx,sy,sz\n")
-        for number, pose in enumerate(capture.taken, 1):
-            cells = [repr(float(v)) for v in (*pose.mean, *pose.spread)]
-            file.write(",".join([str(number), str(pose.n), *cells]) + "\n")
-        file.flush()
-    where = "" if output == "-" else f" in {output}"
+
+def _kept(capture: Capture, file: PoseFile) -> str:
+    """Return what to say of the poses that are written."""
+    if not file.kept:
+        parts = ["no pose was taken"] * (not capture.taken) + ["nothing is written"] * (not file.flows)
+        return ", ".join(parts) or "no pose is written"
+    where = "" if file.path == "-" else f" in {file.path}"
     missing = len(capture.missing())
     rest = f", {missing} planned are missing" if missing else ""
-    return f"{len(capture.taken)} pose{'s' * (len(capture.taken) != 1)}{where}{rest}"
+    return f"{file.kept} pose{'s' * (file.kept != 1)}{where}{rest}"

@@ -105,6 +105,8 @@ def command(
     from accelcal_cli.studies.scene import Search
 
     options.check_format(format)
+    type_file = sensor if sensor is not None and Path(sensor).suffix else None
+    options.check_apart([data, config, type_file], {"--raw": raw, "--plot": plot})
     running.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")

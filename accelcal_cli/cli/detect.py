@@ -54,6 +54,7 @@ def command(
         raise UsageError(f"-o - prints the poses as CSV; leave out --format {format}")
     if output is not None and output == plot:
         raise UsageError(f'--plot "{plot}": expected another file than --output')
+    options.check_apart([data], {"-o": output, "--plot": plot})
     if output is not None:
         check_target(output)
     running.check_plot(plot)

@@ -41,6 +41,7 @@ def command(
     check_name(to)
     if driver_scale is not None and not (math.isfinite(driver_scale) and driver_scale > 0):
         raise UsageError(f"--driver-scale {driver_scale:g}: expected a positive number")
+    options.check_apart([result], {"-o": output})
     check_target(output)
     if to == "numpy" and output == "-" and sys.stdout.isatty():
         raise UsageError("--to numpy is no text for a terminal; name a file with -o")

@@ -79,6 +79,7 @@ def command(
     for source in data:
         options.check_input(source)
     options.check_tolerance(tolerance)
+    options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
     stated_g = options.gravity(g, latitude, height)
     stated: dict[str, Any] = {"g": stated_g, "gauge": gauge, "weights": weights}

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
 import typer.core
@@ -131,7 +131,7 @@ def main() -> None:
     except BadUsage as error:
         _explain(error)
     except Interrupted as error:
-        _fail(str(error), INTERRUPTED)
+        _fail(str(error), error.code)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except BrokenPipeError:
@@ -139,7 +139,7 @@ def main() -> None:
     except OSError as error:
         if error.errno == errno.EPIPE:
             _leave_pipe()
-        _drop_output()
+        _drop(sys.stdout)
         _fail(f"cannot write: {(error.strerror or str(error)).lower()}", BAD_INPUT)
     except MemoryError:
         _fail("not enough memory for this input", BAD_INPUT)
@@ -169,16 +169,19 @@ def _open_streams() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"accelcal: {message}", err=True)
+    try:
+        typer.echo(f"accelcal: {message}", err=True)
+    except OSError:  # a terminal that is gone
+        _drop(sys.stderr)
     sys.exit(code)
 
 
 def _leave_pipe() -> NoReturn:
     """Leave quietly when the reader of our output has gone, as `head` does."""
-    _drop_output()
+    _drop(sys.stdout)
     sys.exit(0)
 
 
-def _drop_output() -> None:
-    """Lead what is still buffered for standard output nowhere, or Python would complain of it at its exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _drop(stream: TextIO) -> None:
+    """Lead what is still buffered for a stream nowhere, or Python would complain of it at its exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

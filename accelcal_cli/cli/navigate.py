@@ -95,6 +95,8 @@ def command(
     stated = {"map": map, "voyage": voyage, "period": period}
     settings = {"particles": particles, "generations": generations}
     study = _study(config, stated, filter or (), mode, settings, runs, seed, calibration)
+    inputs = [config, calibration, *study.waters.files()]
+    options.check_apart(inputs, {"-o": output, "--raw": raw, "--plot": plot})
     records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     show(study, records, format if output != "-" else "")
     written = [path for path in (raw, output, plot) if path not in (None, "-")]

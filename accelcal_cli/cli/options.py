@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,7 +13,7 @@ import typer
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from accelcal_cli.calibration.result import Calibration
 
@@ -51,6 +53,30 @@ def check_input(source: str) -> None:
     """Raise UsageError when readings are to come from a terminal, where nobody types them."""
     if source == "-" and sys.stdin.isatty():
         raise UsageError("-: standard input is a terminal; expected the name of a file, or a pipe")
+
+
+def check_apart(inputs: Iterable[str | Path | None], outputs: Mapping[str, str | None]) -> None:
+    """Raise UsageError when an output would take the place of a file that is read.
+
+    Args:
+        inputs: files that are read, - for standard input, None for one that was not stated.
+        outputs: files to write by the option that names them.
+    """
+    read = [_identity(source) for source in inputs if source is not None]
+    for option, output in outputs.items():
+        if output in (None, "-") or not os.path.isfile(output):  # a pipe or a device holds nothing to lose
+            continue
+        written = os.stat(output)
+        if any(source is not None and os.path.samestat(source, written) for source in read):
+            raise UsageError(f'{option} "{output}": is the input itself; expected another name')
+
+
+def _identity(source: str | Path) -> os.stat_result | None:
+    """Return what tells one file from another, whatever it is called; None where there is no file."""
+    try:
+        return os.fstat(sys.stdin.fileno()) if source == "-" else os.stat(source)
+    except (OSError, ValueError):  # it does not exist, or standard input is no file
+        return None
 
 
 def load_result(source: str, data: str | None = None) -> Calibration:

@@ -33,6 +33,7 @@ def command(
 
     if output != "-" and Path(output).suffix not in SUFFIXES and not Path(output).is_dir():
         raise UsageError(f'-o "{output}": expected a name that ends in {" or ".join(SUFFIXES)}')
+    options.check_apart([result], {"-o": output})
     check_target(output)
     check_packages()
     found = options.load_result(result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
@@ -90,6 +91,8 @@ def command(
     stated = {"rate": rate, "hold": hold, "move": move, "tremor": tremor}
     handling = {k: v for k, v in stated.items() if v is not None}
     _check_raw(raw, [*handling, *(["gyro"] * gyro)], samples, attitude)
+    shipped = not Path(sensor).suffix
+    options.check_apart([None if shipped else sensor], {"-o": output, "--truth": truth})
     for path in (output, truth):
         if path is not None:
             check_target(path)

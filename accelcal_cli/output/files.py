@@ -13,9 +13,16 @@ from typing import IO, Any
 
 from accelcal_cli.errors import OutputError
 
+PROBE = 4096
+"""Bytes that a file system must have room for before any work is done: it gives room by blocks of this size."""
+
 
 def check_target(path: str) -> None:
-    """Raise OutputError when `path` cannot be written, before any work is done for it."""
+    """Raise OutputError when `path` cannot be written, before any work is done for it.
+
+    Permissions do not tell everything (a full disk, a folder like /proc): a temporary file is made beside it and
+    removed. A pipe or a device is left alone.
+    """
     if path == "-":
         return
     target = Path(path)
@@ -26,6 +33,22 @@ def check_target(path: str) -> None:
         raise OutputError(f"{path}: no such folder: {folder}")
     if not os.access(folder, os.W_OK) or (target.exists() and not os.access(target, os.W_OK)):
         raise OutputError(f"{path}: permission denied")
+    if target.exists() and not target.is_file():
+        return
+    try:
+        handle, temporary = _part(target)
+        try:
+            with open(handle, "wb", buffering=0) as file:
+                file.write(bytes(PROBE))
+        finally:
+            os.unlink(temporary)
+    except OSError as error:
+        raise unwritten(path, error) from None
+
+
+def _part(target: Path) -> tuple[int, str]:
+    """Make a temporary file beside the one that is to be; return its open handle and its name."""
+    return tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
 
 
 @contextmanager
@@ -49,7 +72,7 @@ def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
     temporary = ""
     try:
         if not device:
-            handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+            handle, temporary = _part(target)
             os.close(handle)
         with open(temporary or target, "wb" if binary else "w", **text) as file:  # type: ignore[call-overload]
             yield file
@@ -58,7 +81,7 @@ def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
             os.replace(temporary, target)
             temporary = ""
     except OSError as error:
-        raise _unwritten(path, error) from None
+        raise unwritten(path, error) from None
     finally:
         if temporary:
             Path(temporary).unlink(missing_ok=True)
@@ -97,13 +120,14 @@ def whole_folder(path: str) -> Iterator[Path]:
         os.replace(temporary, target)
         temporary = ""
     except OSError as error:
-        raise _unwritten(path, error) from None
+        raise unwritten(path, error) from None
     finally:
         if temporary:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _unwritten(path: str, error: OSError) -> OutputError:
+def unwritten(path: str, error: OSError) -> OutputError:
+    """Return what to raise for a file or folder that the system refuses to write."""
     return OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}")
 
 

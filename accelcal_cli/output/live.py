@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from types import TracebackType
 
 from rich.console import Group
@@ -49,7 +50,8 @@ class Watch:
     ) -> None:
         """Leave the last picture as it is."""
         if self.live:
-            self.live.stop()
+            with suppress(OSError):  # a terminal that is gone shows nothing more
+                self.live.stop()
 
     def see(self, status: Status) -> None:
         """Show what the sensor is doing now; a pose that was taken sounds the bell."""

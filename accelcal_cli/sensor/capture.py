@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from accelcal_cli.sensor.units import check_unit
 from accelcal_cli.streams import Float
 
 STILL = 0.01
@@ -147,6 +148,7 @@ class Capture:
         still: float | None = None,
         scale: float | None = None,
         centre: Float | None = None,
+        unit: str | None = None,
     ) -> None:
         """Wait for poses.
 
@@ -155,9 +157,10 @@ class Capture:
             window: readings that stillness is judged by; hold: still readings that make a pose.
             still: largest standard deviation of a still axis, output units; 1 % of 1 g when None.
             scale: output of 1 g; centre: output at no acceleration, shape (3,); estimated when None.
+            unit: one of units.OUTPUT_OF_1_G, which the first pose is held against; None for any other.
         """
         self.planned, self.hold, self.still = planned, max(hold, window), still
-        self.stated = (scale, centre)
+        self.stated, self.unit = (scale, centre), unit
         self.taken: list[Held] = []
         self.window = np.zeros((window, 3))
         self.seen = 0
@@ -166,7 +169,11 @@ class Capture:
         self.rough: Rough | None = None
 
     def push(self, reading: Float) -> Status | None:
-        """Take in one reading, shape (3,); None while the first window fills."""
+        """Take in one reading, shape (3,); None while the first window fills.
+
+        Raises:
+            DataError: the first pose cannot be 1 g in the stated unit; it is not taken.
+        """
         self.window[self.seen % len(self.window)] = reading
         self.seen += 1
         if self.seen < len(self.window):
@@ -199,6 +206,8 @@ class Capture:
         return "taken"
 
     def _take(self, held: Held) -> None:
+        if self.unit is not None and not self.taken:
+            check_unit(held.mean - (0.0 if self.stated[1] is None else self.stated[1]), self.unit)
         self.taken.append(held)
         self.run, self.done_here = [], True
         self.rough = rough_sensor(np.array([pose.mean for pose in self.taken]), *self.stated)

@@ -42,6 +42,11 @@ class Clock:
     rate: float | None = None
     unit: str = "s"
 
+    @property
+    def period(self) -> float | None:
+        """From row to row, in the unit of the time column; None where nothing says it."""
+        return None if self.rate is None else 1.0 / (self.rate * UNITS[self.unit])
+
     @classmethod
     def of(cls, time: Floats, unit: str | None = None) -> Self:
         """Tell the rate from the first rows, shape (n,), and the unit where it is not stated.

@@ -67,6 +67,7 @@ class Windows:
         first: number of the first window, that of its first tile.
         mean: shape (B, 3); variance: norm of the variances, shape (B,).
         rate: mean of the gyroscope, shape (B, 3); spread: sum of its variances, shape (B,).
+        broken: whether there is a gap in time in it, shape (B,).
     """
 
     first: int
@@ -74,6 +75,7 @@ class Windows:
     variance: Floats
     rate: Floats
     spread: Floats
+    broken: NDArray[np.bool_]
 
     def turning(self, bias: Floats) -> Floats:
         """Return the mean square of the turning rate about its bias, shape (B,)."""
@@ -93,8 +95,11 @@ def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
         if tiles.gyro:
             rate, turned = _window(block[:, 6:12], tiles.size, width, take)
             spread = turned.sum(axis=0)
+        broken = np.zeros(variance.shape[1], dtype=bool)
+        if tiles.timed:
+            broken = tiles.gaps.limit.spanned(block[:, -2], block[:, -1], width)[start::step]
         norm = np.sqrt(variance[0] ** 2 + variance[1] ** 2 + variance[2] ** 2)
-        yield Windows(first + start, mean.T, norm, rate.T, spread)
+        yield Windows(first + start, mean.T, norm, rate.T, spread, broken)
 
 
 def _window(moments: Floats, size: int, width: int, take: slice) -> tuple[Floats, Floats]:
@@ -184,8 +189,10 @@ def runs(
     still_before = np.zeros(len(multipliers), dtype=bool)
     for block in windows(tiles, rows.width):
         turning = block.turning(level.bias)
+        whole = ~block.broken  # nobody knows what happened in a gap
         for k, multiplier in enumerate(multipliers):
-            still = (block.variance <= multiplier * level.variance) & (turning <= multiplier * level.turning)
+            calm = (block.variance <= multiplier * level.variance) & (turning <= multiplier * level.turning)
+            still = whole & calm
             change = np.flatnonzero(np.diff(still, prepend=still_before[k])) + block.first
             starts[k].append(change[int(still_before[k]) :: 2])
             ends[k].append(change[1 - int(still_before[k]) :: 2] - 1)

@@ -13,10 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.sensor.envelope import Envelope
+from accelcal_cli.sensor.gaps import Gaps, Limit
 from accelcal_cli.sensor.rawlog import RawLog, RawRows
+from accelcal_cli.sensor.spans import Rows
 from accelcal_cli.sensor.spool import RowStore
 
 Floats = NDArray[np.float64]
+
+NO_GAP = Limit()
 
 IN_MEMORY = 1_000_000
 """Tiles kept in memory: a day of 100 Hz with windows of 1 s; more go to a temporary file."""
@@ -32,11 +36,13 @@ class Tiles:
         size: rows of a tile.
         gyro, timed: whether the log has a gyroscope and time.
         rows: rows of the log, those left out included.
+        gaps: those of the time column.
     """
 
-    def __init__(self, size: int, gyro: bool, timed: bool) -> None:
-        """Start without tiles."""
+    def __init__(self, size: int, gyro: bool, timed: bool, limit: Limit = NO_GAP) -> None:
+        """Start without tiles; `limit` says what is a gap."""
         self.size, self.gyro, self.timed = size, gyro, timed
+        self.gaps = Gaps(limit)
         self.rows = 0
         self._store = RowStore(6 + 6 * gyro + 2 * timed, IN_MEMORY)
         self._rest: Floats | None = None
@@ -76,7 +82,9 @@ class Tiles:
             out[:, at] = mean
             out[:, at + 3] = np.einsum("ij,ij->i", off, off)
         if self.timed:
-            out[:, -2], out[:, -1] = block[-1, :: self.size], block[-1, self.size - 1 :: self.size]
+            time = block[-1].reshape(tiles, self.size)
+            out[:, -2], out[:, -1] = time[:, 0], time[:, -1]
+            self.gaps.see(time)
         self._store.append(out)
         if envelope is not None:
             envelope.add(block[:3].reshape(3, tiles, self.size), block[-1] if self.timed else None)
@@ -90,9 +98,10 @@ class Tiles:
             tail = joined[max(0, len(joined) - overlap) :] if overlap else None
 
 
-def read_tiles(log: RawLog, size: int, envelope: Envelope | None = None) -> Tiles:
-    """Read a log to its end and return its tiles of `size` rows."""
-    tiles = Tiles(size, log.columns.gyro is not None, log.columns.time is not None)
+def read_tiles(log: RawLog, rows: Rows, envelope: Envelope | None = None) -> Tiles:
+    """Read a log to its end and return its tiles."""
+    gyro, timed = log.columns.gyro is not None, log.columns.time is not None
+    tiles = Tiles(rows.tile, gyro, timed, Limit.of(log.clock, rows))
     for raw in log.blocks():
         tiles.add(raw, envelope)
     return tiles

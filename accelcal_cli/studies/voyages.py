@@ -52,6 +52,10 @@ class Waters:
         if self.period != round(self.period):
             raise ConfigError(f"period: {self.period:g} s; expected whole seconds")
 
+    def files(self) -> list[str]:
+        """Return the files that are read: map and voyage, as far as they are none of ours."""
+        return [path for path in (self.map if self.map not in PRESETS else "", self.voyage) if path]
+
     def hashed(self) -> Waters:
         """Return the same with the hashes of its files, so that other contents are another study."""
         if self.map not in PRESETS and not Path(self.map).suffix and not Path(self.map).exists():
@@ -59,8 +63,7 @@ class Waters:
                 f'unknown map "{self.map}"{did_you_mean(self.map, PRESETS)}; known: {", ".join(PRESETS)}, or the path '
                 "of a file"
             )
-        files = [path for path in (self.map if self.map not in PRESETS else "", self.voyage) if path]
-        return replace(self, digests=" ".join(map(digest, files)))
+        return replace(self, digests=" ".join(map(digest, self.files())))
 
     def gravity_map(self, seed: int) -> GravityMap:
         """Return the map. Raises DataError when its file cannot be used."""

@@ -241,18 +241,26 @@ def device():
     found.unplug()
 
 
+CONTROL = "import fcntl, os, sys, termios; fcntl.ioctl(2, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+"""Take standard error for the controlling terminal, then become the program of the arguments."""
+
+
 @pytest.fixture
 def start(tmp_path):
     """Start the command as a program; it is ended with the test."""
     pytest.importorskip("serial")
     started = []
 
-    def begin(*arguments, stderr=subprocess.PIPE):
+    def begin(*arguments, stderr=subprocess.PIPE, terminal=False):
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
         environment = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "error", "TERM": "xterm"}
         command = [sys.executable, "-m", "accelcal_cli", "capture", *arguments]
         streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": stderr}
-        program = subprocess.Popen(command, cwd=tmp_path, env=environment, encoding="utf-8", **streams)
+        if terminal:  # of its own: its standard error, which sends a hangup when it goes
+            command = [sys.executable, "-c", CONTROL, *command]
+        program = subprocess.Popen(
+            command, cwd=tmp_path, env=environment, encoding="utf-8", start_new_session=terminal, **streams
+        )
         started.append(program)
         return program
 
@@ -291,15 +299,65 @@ def test_all_poses_over_a_serial_line(device, start, tmp_path):
     np.testing.assert_allclose(taken.output(), MEMS.output(G * held(PLANNED, 3.0)), atol=0.02)
 
 
-def test_poses_are_kept_when_it_is_interrupted(device, start, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, "interrupted"),
+        (signal.SIGHUP, 129, "ended by SIGHUP"),
+        (signal.SIGTERM, 143, "ended by SIGTERM"),
+    ],
+)
+def test_poses_are_kept_when_it_is_interrupted(device, start, tmp_path, number, code, said):
     program = start("--port", device.name, *FAST, "-o", "poses.csv")
     until(program, "12 poses to take")
     device.send(text_of(hand(PLANNED[:3])))
     until(program, "pose 3")
-    program.send_signal(signal.SIGINT)
+    program.send_signal(number)
     _, err = program.communicate()
-    assert program.returncode == 130
-    assert err == "accelcal: interrupted; 3 poses in poses.csv, 9 planned are missing\n"
+    assert program.returncode == code
+    assert err == f"accelcal: {said}; 3 poses in poses.csv, 9 planned are missing\n"
+    assert read_readings(tmp_path / "poses.csv").poses == 3
+    assert os.listdir(tmp_path) == ["poses.csv"]
+
+
+def test_every_pose_is_in_the_file_when_it_is_said_to_be_taken(device, start, tmp_path):
+    program = start("--port", device.name, *FAST, "-o", "poses.csv")
+    until(program, "12 poses to take")
+    device.send(text_of(hand(PLANNED[:3])))
+    for number in (1, 2, 3):
+        until(program, f"pose {number}")
+        assert len((tmp_path / "poses.csv").read_text("utf-8").splitlines()) >= number + 1
+    program.kill()
+    program.communicate()
+    assert len((tmp_path / "poses.csv").read_text("utf-8").splitlines()) == 4
+    assert os.listdir(tmp_path) == ["poses.csv"]
+
+
+def test_a_hangup_that_is_ignored_stays_ignored(device, start, tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        program = start("--port", device.name, *FAST, "-o", "poses.csv")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    until(program, "12 poses to take")
+    program.send_signal(signal.SIGHUP)
+    device.send(text_of(hand(PLANNED)))
+    program.communicate()
+    assert program.returncode == 0
+
+
+def test_poses_are_kept_when_the_terminal_goes(device, start, tmp_path):
+    screen, slave = pty.openpty()
+    program = start("--port", device.name, *FAST, "-o", "poses.csv", stderr=slave, terminal=True)
+    os.close(slave)
+    shown = b""
+    while b"waiting for readings" not in shown:
+        shown += os.read(screen, 65536)
+    device.send(text_of(hand(PLANNED[:3])))
+    while shown.count(b"\a") < 3:
+        shown += os.read(screen, 65536)
+    os.close(screen)
+    assert program.wait() == 129
     assert read_readings(tmp_path / "poses.csv").poses == 3
 
 
