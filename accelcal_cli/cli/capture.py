@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import options, pipes
 from accelcal_cli.errors import DataError, Interrupted, UsageError
 
 if TYPE_CHECKING:
@@ -173,12 +173,11 @@ def _write(capture: Capture, output: str) -> str:
 
     if not capture.taken:
         return "no pose was taken, nothing is written"
-    with whole_file(output) as file:
+    with pipes.even_if_unread(), whole_file(output) as file:
         file.write("pose,n,Nx,Ny,Nz,sx,sy,sz\n")
         for number, pose in enumerate(capture.taken, 1):
             cells = [repr(float(v)) for v in (*pose.mean, *pose.spread)]
             file.write(",".join([str(number), str(pose.n), *cells]) + "\n")
-        file.flush()
     where = "" if output == "-" else f" in {output}"
     missing = len(capture.missing())
     rest = f", {missing} planned are missing" if missing else ""

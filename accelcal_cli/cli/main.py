@@ -16,6 +16,7 @@ import typer.core
 import typer.main
 
 from accelcal_cli import __version__
+from accelcal_cli.cli import pipes
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -139,7 +140,7 @@ def main() -> None:
     except OSError as error:
         if error.errno == errno.EPIPE:
             _leave_pipe()
-        _drop_output()
+        pipes.drop(sys.stdout)
         _fail(f"cannot write: {(error.strerror or str(error)).lower()}", BAD_INPUT)
     except MemoryError:
         _fail("not enough memory for this input", BAD_INPUT)
@@ -175,10 +176,5 @@ def _fail(message: str, code: int) -> NoReturn:
 
 def _leave_pipe() -> NoReturn:
     """Leave quietly when the reader of our output has gone, as `head` does."""
-    _drop_output()
+    pipes.drop(sys.stdout)
     sys.exit(0)
-
-
-def _drop_output() -> None:
-    """Lead what is still buffered for standard output nowhere, or Python would complain of it at its exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import options, pipes
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -79,7 +79,8 @@ def command(
     stated_g = options.gravity(g, latitude, height)
     so_far = _so_far(data, columns, stated_g, quiet) if data is not None else None
     found = _plan(so_far, poses, add, fixture, noise, stated_g)
-    _show(found, format)
+    with pipes.even_if_unread():
+        _show(found, format)
     if found.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
 
@@ -146,4 +147,3 @@ def _show(found: Plan, format: str) -> None:
         expected = parameter_table(found)
         if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
             console.show([expected], out)
-    sys.stdout.flush()
