@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -88,20 +89,29 @@ def command(
 def _so_far(data: str, columns: str | None, g: float | None, quiet: bool) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.pipeline import calibrate
-    from accelcal_cli.config import load_result, load_settings
+    from accelcal_cli.config import is_result, load_result, load_settings
     from accelcal_cli.sensor.readings import read_readings
 
-    if Path(data).suffix in RESULTS:
+    options.check_input(data)
+    stdin = io.BufferedReader(cast("Any", sys.stdin.buffer)) if data == "-" else None
+    if Path(data).suffix in RESULTS or (stdin is not None and is_result(_head(stdin))):
         if columns is not None or g is not None:
             raise UsageError(
                 f"{data}: a result file has its own columns and g; leave out --columns, --g and --latitude"
             )
-        return load_result(data)
-    options.check_input(data)
+        return load_result(data if stdin is None else "<stdin>", stdin)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
-    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+    readings = read_readings(data, options.split_columns(columns), stdin=stdin)
     options.caution(readings.source, readings.cautions, quiet)
     return calibrate(readings, settings)
+
+
+def _head(stdin: io.BufferedReader) -> bytes:
+    """Return how standard input begins; nothing where it cannot be read, which the reader of it will say."""
+    try:
+        return stdin.peek()
+    except OSError:
+        return b""
 
 
 def _plan(

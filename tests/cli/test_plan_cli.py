@@ -61,6 +61,29 @@ def test_readings_may_come_through_a_pipe(run, faces, tmp_path):
     assert piped.out == run("plan", faces, "--format", "csv").out
 
 
+@pytest.mark.parametrize("name", ["r.yaml", "r.json"])
+def test_a_result_may_come_through_a_pipe(run, good, tmp_path, name):
+    assert run("calibrate", good, "-o", name, "-q").code == 0
+    text = (tmp_path / name).read_bytes()
+    for form in (
+        text,
+        b"\xef\xbb\xbf\n" + text,
+        b"# mine\n---\n" + text if name == "r.yaml" else b"\n" + text,
+    ):
+        piped = run("plan", "-", "--add", "2", "--format", "json", stdin=form)
+        assert (piped.code, piped.err) == (0, "")
+        assert piped.out == run("plan", name, "--add", "2", "--format", "json").out
+    refused = run("plan", "-", "--g", "9.81", stdin=text)
+    assert refused.code == 2
+    assert "a result file has its own columns and g" in refused.err
+
+
+def test_a_record_through_a_pipe_that_is_none_of_a_calibration_is_refused(run):
+    done = run("plan", "-", stdin=b'{"schema": "accelcal/verification/1"}')
+    assert done.code == 2
+    assert done.err.startswith("accelcal: <stdin>: schema is 'accelcal/verification/1'; expected")
+
+
 def test_the_table_says_how_to_hold_the_sensor(run):
     done = run("plan", "--poses", "12", "--fixture", "edges", "--noise", "0.01")
     assert done.code == 0
