@@ -78,15 +78,18 @@ def command(
     if poses is not None and add is not None:
         raise UsageError("--poses and --add: expected one of them, not both")
     stated_g = options.gravity(g, latitude, height)
-    so_far = _so_far(data, columns, stated_g, quiet) if data is not None else None
+    so_far = _so_far(data, columns, stated_g) if data is not None else None
     found = _plan(so_far, poses, add, fixture, noise, stated_g)
     with pipes.even_if_unread():
         _show(found, format)
+    with pipes.even_if_unread(sys.stderr):
+        if so_far is not None and format != "table":  # the table shows them itself
+            options.caution(str(data), so_far.cautions, quiet)
     if found.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
 
 
-def _so_far(data: str, columns: str | None, g: float | None, quiet: bool) -> Calibration:
+def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.pipeline import calibrate
     from accelcal_cli.config import is_result, load_result, load_settings
@@ -102,7 +105,6 @@ def _so_far(data: str, columns: str | None, g: float | None, quiet: bool) -> Cal
         return load_result(data if stdin is None else "<stdin>", stdin)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
     readings = read_readings(data, options.split_columns(columns), stdin=stdin)
-    options.caution(readings.source, readings.cautions, quiet)
     return calibrate(readings, settings)
 
 
@@ -138,7 +140,8 @@ def _plan(
         return plan(np.zeros((9, 9)), 0, count, fixture, None if noise is None else noise / local_g)
     known = so_far.s if so_far.freedom > 0 and so_far.s > 0 else None
     sigma = noise or known
-    return plan(so_far.information, taken, count, fixture, None if sigma is None else sigma / so_far.g)
+    part = None if sigma is None else sigma / so_far.g
+    return plan(so_far.information, taken, count, fixture, part, so_far)
 
 
 def _show(found: Plan, format: str) -> None:
@@ -153,6 +156,10 @@ def _show(found: Plan, format: str) -> None:
         from accelcal_cli.output import console
 
         out = console.console()
+        known = found.so_far
+        if known is not None and (known.cautions or found.beyond_poses):
+            console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
+            out.print()
         console.show_split(pose_table(found), out)
         expected = parameter_table(found)
         if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 
+import numpy as np
 import pytest
 
 
@@ -76,6 +77,31 @@ def test_a_result_may_come_through_a_pipe(run, good, tmp_path, name):
     refused = run("plan", "-", "--g", "9.81", stdin=text)
     assert refused.code == 2
     assert "a result file has its own columns and g" in refused.err
+
+
+def test_what_calibrate_says_of_the_poses_so_far_is_carried_on(run, tmp_path):
+    """Random numbers: their directions are many, but no sensor reads so."""
+    rows = np.random.default_rng(1).normal(size=(30, 3))
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",")
+    said = json.loads(run("calibrate", "r.csv", "--optimizer", "levenberg-marquardt", "--format", "json").out)
+    done = run("plan", "r.csv", "--add", "2", "--format", "json")
+    record = json.loads(done.out)
+    assert (done.code, record["verdict"]) == (1, "undetermined")
+    assert record["so_far"] == {key: said[key] for key in ("verdict", "reasons", "cautions")}
+    assert "r.csv: caution: After calibration one pose errs by" in done.err
+    assert run("plan", "r.csv", "--add", "2", "--format", "json", "-q").err == ""
+    shown = run("plan", "r.csv", "--add", "2")
+    assert (shown.code, shown.err) == (1, "")
+    assert shown.out.startswith("Verdict so far: undetermined\n  The least cost lies outside the search box")
+    assert "Caution: After calibration" in shown.out
+    assert "More poses do not mend the verdict on those so far" in shown.out
+
+
+def test_poses_that_only_lack_others_are_mended_by_them(run, faces):
+    record = json.loads(run("plan", faces, "--format", "json").out)
+    assert record["so_far"]["verdict"] == "undetermined"
+    assert record["verdict"] == "good"
+    assert json.loads(run("plan", "--format", "json").out)["so_far"] is None
 
 
 def test_a_record_through_a_pipe_that_is_none_of_a_calibration_is_refused(run):
