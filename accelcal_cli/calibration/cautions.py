@@ -77,11 +77,16 @@ def not_fitting(outlying: Sequence[str], other: str = "") -> tuple[str, ...]:
 def _more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
     if ratio is None or chance is None or ratio < MORE_THAN_NOISE or chance > SURELY:
         return ()
-    times = f"{ratio:.2g}" if ratio < 100 else f"{ratio:,.0f}"
     return (
-        f"The residuals are {times} times what the scatter within the poses explains: the sensor moved in them, "
-        "changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the poses alone.",
+        f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
+        "moved in them, changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the "
+        "poses alone.",
     )
+
+
+def ratio_in_words(ratio: float) -> str:
+    """Return a ratio with two digits, or more where it is large."""
+    return f"{ratio:.2g}" if ratio < 100 else f"{ratio:,.0f}"
 
 
 def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:

@@ -37,7 +37,8 @@ def command(
     """Say whether a sensor has changed since it was calibrated.
 
     Compares the result with new readings: a chi-square test of all nine parameters, each of them alone, and the rms
-    of |f| - g against a tolerance. Exit code 1 means that the sensor has changed or that --tolerance was missed.
+    of |f| - g against a tolerance. Exit code 1 means that the sensor has changed, that these readings cannot tell, or
+    that --tolerance was missed.
     """
     from accelcal_cli.calibration.verify import verify
     from accelcal_cli.sensor.readings import read_readings
@@ -54,7 +55,9 @@ def command(
     with pipes.even_if_unread():
         _show(found, format)
     with pipes.even_if_unread(sys.stderr):
-        options.caution(readings.source, readings.cautions, quiet)
+        options.caution(result, old.cautions, quiet)
+        if format != "table":  # the table shows them itself
+            options.caution(readings.source, found.cautions, quiet)
         if not found.within and not quiet:
             typer.echo(f"accelcal: rms {found.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
     if not found.passed:

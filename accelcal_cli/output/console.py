@@ -23,6 +23,7 @@ VERDICT_STYLE = {
     "undetermined": "bold red",
     "unchanged": "bold green",
     "changed": "bold red",
+    "inconclusive": "bold yellow",
 }
 
 
