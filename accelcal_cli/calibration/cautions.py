@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from accelcal_cli.calibration.search import Solution
 from accelcal_cli.calibration.settings import Settings
 
 MORE_THAN_NOISE, SURELY = 2.0, 1e-3
@@ -26,8 +25,8 @@ on average, and the noise in the products of outputs doubles it. Measured at s/g
 
 
 def cautions(
-    solution: Solution,
     settings: Settings,
+    agreeing: int,
     s: float,
     sigma_scale: float,
     noise: tuple[float | None, float | None],
@@ -36,7 +35,7 @@ def cautions(
     """Return the cautions of a solution, in sentences, the gravest first.
 
     Args:
-        solution, settings: the calibration.
+        settings: of the calibration; agreeing: how many of its searches ended in the best minimum.
         s: standard deviation of one pose's modulus, in the unit of g; NaN where nothing tells it.
         sigma_scale: the largest of a scale factor, as a part of it.
         noise: s over what the scatter within poses predicts, and the chance of so large a ratio; None where nothing
@@ -48,7 +47,7 @@ def cautions(
         *_more_than_noise(*noise),
         *not_fitting(outlying, "or use --robust" if settings.robust == "none" else ""),
         *_noise_bias(s, settings.g, sigma_scale),
-        *_search(solution, settings),
+        *_search(agreeing, settings.runs),
     )
 
 
@@ -99,7 +98,5 @@ def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:
     )
 
 
-def _search(solution: Solution, settings: Settings) -> tuple[str, ...]:
-    if settings.runs > 1 and solution.agreeing < settings.runs:
-        return (f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.",)
-    return ()
+def _search(agreeing: int, runs: int) -> tuple[str, ...]:
+    return (f"{agreeing} of {runs} searches ended in the best minimum.",) if agreeing < runs else ()

@@ -12,6 +12,7 @@ from accelcal_cli.sensor.cells import Rows
 from accelcal_cli.sensor.columns import Columns
 from accelcal_cli.sensor.repeats import LabelledMeans
 from accelcal_cli.sensor.spool import IN_MEMORY, RowStore
+from accelcal_cli.streams import Float
 
 Floats = NDArray[np.float64]
 STUCK = 1_000_000  # equal readings in a row after which an input is not read on
@@ -119,22 +120,13 @@ class Collector:
             self.notes.append(f"columns beside the readings not used: more than {IN_MEMORY:,} poses")
 
     def _by_row(self) -> Extras:
-        if self.store.rows >= RAW_ROWS and (self.columns.time is not None or self._creeps()):
-            self.cautions.append(
-                f"Each row is taken for a pose at rest. If these {self.store.rows:,} rows are a log with moves in it, "
-                "find its poses with accelcal detect, or calibrate with --raw; of many readings of one pose, label the "
-                "poses in a column."
-            )
+        _, first = next(iter(self.store.blocks(LOOKED_AT)), (0, np.zeros((0, 3))))
+        span = float((self.extent.upper - self.extent.lower).max())
+        self.cautions += log_cautions(self.store.rows, first, span, timed=self.columns.time is not None)
         if not self._extras:
             return Extras()
         count, scatter, others = self._split(np.concatenate(self._extras))
         return Extras(None, count, scatter, *self._others(others))
-
-    def _creeps(self) -> bool:
-        """Whether most of the first rows are much like the row before."""
-        _, first = next(iter(self.store.blocks(LOOKED_AT)))
-        steps = np.abs(np.diff(first, axis=0)).max(axis=1)
-        return bool(np.median(steps) < ALIKE * (self.extent.upper - self.extent.lower).max())
 
     def _by_label(self, means: LabelledMeans[str]) -> Extras:
         if len(means.rows):
@@ -152,6 +144,23 @@ class Collector:
         reference = None if self.columns.reference is None else others[:, :3]
         temperature = None if self.columns.temperature is None else others[:, -1]
         return reference, temperature
+
+
+def log_cautions(rows: int, first: Float, span: float, *, timed: bool) -> tuple[str, ...]:
+    """Return a caution of rows that are taken for poses and may be a log: timed, or each much like the one before.
+
+    Args:
+        rows: how many; first: the first of them, shape (B, 3), LOOKED_AT at most.
+        span: the largest range of an axis; timed: whether they have times.
+    """
+    if rows < RAW_ROWS:
+        return ()
+    if not timed and np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) >= ALIKE * span:
+        return ()
+    return (
+        f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, find its poses with "
+        "accelcal detect, or calibrate with --raw; of many readings of one pose, label the poses in a column.",
+    )
 
 
 def _others(columns: Columns) -> int:
