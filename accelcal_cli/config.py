@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -97,6 +98,15 @@ def load_result(path: str | Path, stdin: BinaryIO | None = None) -> Calibration:
         except ConfigError as error:
             raise ConfigError(f"{error}; the result file of a calibration was expected") from None
     return Calibration.from_record(record, str(path))
+
+
+RECORD_HEAD = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s|#[^\n]*\n|---\s)*(?:\{|['\"]?(?:K_a|D_a|schema)['\"]?:)")
+"""How the record of a calibration begins, as JSON or YAML in our order of keys or sorted; no table of readings does."""
+
+
+def is_result(head: bytes) -> bool:
+    """Return whether a file that begins so is a result file rather than readings."""
+    return RECORD_HEAD.match(head) is not None
 
 
 def dump(record: Mapping[str, Any]) -> str:

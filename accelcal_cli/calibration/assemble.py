@@ -10,7 +10,6 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration import quality, sigma
 from accelcal_cli.calibration.cautions import cautions
-from accelcal_cli.calibration.chances import chi_square_chance
 from accelcal_cli.calibration.judgement import judge, notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
@@ -18,7 +17,8 @@ from accelcal_cli.calibration.quality import Observabilities
 from accelcal_cli.calibration.residuals import NO_NOISE, Fit, examine, outliers
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import loss_weight, robust_variance
-from accelcal_cli.calibration.search import Solution, lower_problem, model_at
+from accelcal_cli.calibration.scatter import beyond_scatter, explained
+from accelcal_cli.calibration.search import Solution, lower_problem, model_at, to_gain
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.temperature import SLOPES, Slopes
 from accelcal_cli.sensor.model import ErrorModel
@@ -59,6 +59,7 @@ def assemble(
     ratio, chance = noise = _noise(readings, low, s, freedom)
     named = tuple(int(j) for j in outliers(fit.poses, readings.poses, freedom))
     where = [readings.where(j) for j in named]
+    left = 0.0 if settings.polish else to_gain(solution)
     return Calibration(
         K_a=shown.K,
         D_a=shown.D,
@@ -70,7 +71,10 @@ def assemble(
         verdict=judged.verdict,
         reasons=judged.reasons,
         suggestions=judged.suggestions,
-        cautions=(*readings.cautions, *cautions(solution, settings, s, scale_sigma, noise, where)),
+        cautions=(
+            *readings.cautions,
+            *cautions(settings, solution.agreeing, left, s, scale_sigma, noise, where),
+        ),
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
         rms=fit.rms,
@@ -127,17 +131,12 @@ def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], 
 
 def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple[float | None, float | None]:
     """Return s over the noise that the scatter within poses predicts, and the chance of so large a ratio."""
-    if readings.scatter is None or readings.count is None or freedom < 1 or not s > 0:
+    if readings.scatter is None or readings.count is None:
         return None, None
-    force = readings.scatter / np.diagonal(low.K)
     u = low.specific_force(readings.output())
     u = u / np.linalg.norm(u, axis=1, keepdims=True)
-    variance = np.mean(np.sum((u * force) ** 2, axis=1) / readings.count)
-    if not variance > 0:
-        return None, None
-    ratio = s / float(np.sqrt(variance))
-    chance = chi_square_chance(np.array([freedom * ratio**2]), np.array([freedom]))
-    return ratio, float(chance[0])
+    variance = explained(u, readings.scatter, readings.count, np.diagonal(low.K))
+    return beyond_scatter(s, float(np.mean(variance)), freedom)
 
 
 def _pose_fits(readings: Readings, fit: Fit, low: ErrorModel, sight: ErrorModel) -> tuple[PoseFit, ...]:

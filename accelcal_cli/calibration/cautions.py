@@ -8,9 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from accelcal_cli.calibration.search import Solution, rounding
 from accelcal_cli.calibration.settings import Settings
 
 MORE_THAN_NOISE, SURELY = 2.0, 1e-3
@@ -34,8 +31,9 @@ on average, and the noise in the products of outputs doubles it. Measured at s/g
 
 
 def cautions(
-    solution: Solution,
     settings: Settings,
+    agreeing: int,
+    left: float,
     s: float,
     sigma_scale: float,
     noise: tuple[float | None, float | None],
@@ -44,7 +42,8 @@ def cautions(
     """Return the cautions of a solution, in sentences, the gravest first.
 
     Args:
-        solution, settings: the calibration.
+        settings: of the calibration; agreeing: how many of its searches ended in the best minimum.
+        left: the part of the cost that one more step would take off.
         s: standard deviation of one pose's modulus, in the unit of g; NaN where nothing tells it.
         sigma_scale: the largest of a scale factor, as a part of it.
         noise: s over what the scatter within poses predicts, and the chance of so large a ratio; None where nothing
@@ -56,8 +55,8 @@ def cautions(
         *large_residuals(s, settings.g),
         *_more_than_noise(*noise),
         *_noise_bias(s, settings.g, sigma_scale),
-        *_search(solution, settings),
-        *_gravity(settings.g),
+        *_search(agreeing, settings.runs, left),
+        *odd_gravity(settings.g),
     )
 
 
@@ -86,11 +85,16 @@ def not_fitting(outlying: Sequence[str], other: str = "") -> tuple[str, ...]:
 def _more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
     if ratio is None or chance is None or ratio < MORE_THAN_NOISE or chance > SURELY:
         return ()
-    times = f"{ratio:.2g}" if ratio < 100 else f"{ratio:,.0f}"
     return (
-        f"The residuals are {times} times what the scatter within the poses explains: the sensor moved in them, "
-        "changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the poses alone.",
+        f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
+        "moved in them, changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the "
+        "poses alone.",
     )
+
+
+def ratio_in_words(ratio: float) -> str:
+    """Return a ratio with two digits, or more where it is large."""
+    return f"{ratio:.2g}" if ratio < 100 else f"{ratio:,.0f}"
 
 
 def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:
@@ -103,30 +107,20 @@ def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:
     )
 
 
-def _search(solution: Solution, settings: Settings) -> tuple[str, ...]:
+def _search(agreeing: int, runs: int, left: float) -> tuple[str, ...]:
     lines = []
-    left = 0.0 if settings.polish else _to_gain(solution)
     if left > STOPPED_SHORT:
         lines.append(
             f"The search stopped short of the minimum: a step more would take {left:.0%} off the cost. "
             "Leave out --no-polish, or search longer."
         )
-    if settings.runs > 1 and solution.agreeing < settings.runs:
-        lines.append(f"{solution.agreeing} of {settings.runs} searches ended in the best minimum.")
+    if agreeing < runs:
+        lines.append(f"{agreeing} of {runs} searches ended in the best minimum.")
     return tuple(lines)
 
 
-def _to_gain(solution: Solution) -> float:
-    """Return the part of the cost that a Gauss-Newton step is expected to take off, 0 where only rounding is left."""
-    problem, x = solution.problem, solution.x[:, None]
-    if solution.cost <= rounding(problem):
-        return 0.0
-    residual, slope = problem.residuals(x)[0, 0], problem.jacobian(x)[0, 0]
-    step = np.linalg.lstsq(slope, residual)[0]
-    return float(np.sum((slope @ step) ** 2) / np.sum(residual**2))
-
-
-def _gravity(g: float) -> tuple[str, ...]:
+def odd_gravity(g: float) -> tuple[str, ...]:
+    """Return a caution of a gravity, m/s^2 or 1 for units of g, that is not found on Earth."""
     if g == 1.0 or EARTH[0] <= g <= EARTH[1]:
         return ()
     return (

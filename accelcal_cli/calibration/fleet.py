@@ -15,6 +15,7 @@ import numpy as np
 from accelcal_cli.calibration.assemble import assemble
 from accelcal_cli.calibration.compress import compress_each
 from accelcal_cli.calibration.ellipsoid import least_squares
+from accelcal_cli.calibration.fleet_cautions import fleet_cautions
 from accelcal_cli.calibration.fleet_fit import pose_weights, reasons, residuals
 from accelcal_cli.calibration.lotters import Loetters
 from accelcal_cli.calibration.nominal import Start, search_box
@@ -45,6 +46,7 @@ class Fleet:
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
         verdict: good, weak, undetermined or failed, shape (R,); reason: why it is not good, in sentences.
+        caution: what speaks against the readings, in the sentences of `calibrate`, shape (R,).
         outlying: the poses beyond chance, in words.
     """
 
@@ -62,6 +64,7 @@ class Fleet:
     rms_before: Float
     verdict: np.ndarray
     reason: np.ndarray
+    caution: np.ndarray
     outlying: np.ndarray
 
     @property
@@ -146,6 +149,7 @@ def _failed(batch: Batch) -> Fleet:
         rms_before=nan(),
         verdict=np.full(len(words), FAILED, dtype=object),
         reason=np.array([f"Nothing to calibrate: {word}." for word in words], dtype=object),
+        caution=np.full(len(words), "", dtype=object),
         outlying=np.full(len(words), "", dtype=object),
     )
 
@@ -173,8 +177,9 @@ def _calibrated(
         final_verdict(word, bool(wall), int(left))
         for word, wall, left in zip(seen.verdicts, walled, freedom, strict=True)
     ]
-    sigma_k, sigma_d = propagate(K, lower, covariance(seen, variance, walled, g), settings.gauge, g)
-    rms, rms_before, outlying = residuals(readings, batch, lower, D, start, seen, weights, settings)
+    nine, s = covariance(seen, variance, walled, g), np.sqrt(variance)
+    sigma_k, sigma_d = propagate(K, lower, nine, settings.gauge, g)
+    fits = residuals(readings, batch, lower, D, start, seen, weights, settings)
     if keep is not None:
         for at, number in enumerate(batch.sensors.tolist()):
             own = None if weights is None else weights[at, : batch.count[at]]
@@ -190,12 +195,13 @@ def _calibrated(
         lower=lower,
         dop=seen.dop,
         cost=run.cost,
-        s=np.sqrt(variance),
-        rms=rms,
-        rms_before=rms_before,
+        s=s,
+        rms=fits.rms,
+        rms_before=fits.rms_before,
         verdict=np.array(verdict, dtype=object),
         reason=reasons(problem, start, run, seen, batch, verdict),
-        outlying=outlying,
+        caution=fleet_cautions(readings, batch, settings, s, nine, fits),
+        outlying=fits.in_words(),
     )
 
 

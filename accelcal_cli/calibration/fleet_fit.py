@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +12,16 @@ from accelcal_cli.calibration.left_out import leave_out
 from accelcal_cli.calibration.lotters import Loetters
 from accelcal_cli.calibration.nominal import Start, taken_for
 from accelcal_cli.calibration.quality import Observabilities
-from accelcal_cli.calibration.residuals import beyond_chance, is_suspect, leverages, room_of, studentise
+from accelcal_cli.calibration.residuals import (
+    KEPT,
+    KEPT_WORST,
+    beyond_chance,
+    is_suspect,
+    leverages,
+    room_of,
+    studentise,
+)
+from accelcal_cli.calibration.scatter import explained
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verdict import edge_names, reasons_of
 from accelcal_cli.errors import DataError
@@ -21,6 +31,30 @@ from accelcal_cli.streams import Float
 
 NAMED = 3
 """Outlying poses of a sensor that are named one by one."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFits:
+    """Residuals of R sensors.
+
+    Attributes:
+        rms, rms_before: of |f| - g after and before, m/s^2, shape (R,).
+        outlying: names of each sensor's poses beyond chance.
+        explained: variance of a pose that the scatter within poses explains, (m/s^2)^2, shape (R,); NaN if not known.
+    """
+
+    rms: Float
+    rms_before: Float
+    outlying: list[list[str]]
+    explained: Float
+
+    def in_words(self) -> np.ndarray:
+        """Return the outlying poses of each sensor, the first few by name, shape (R,)."""
+        words = np.full(len(self.outlying), "", dtype=object)
+        for at, names in enumerate(self.outlying):
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            words[at] = ", ".join(names[:NAMED]) + more
+        return words
 
 
 def pose_weights(readings: FleetReadings, batch: Batch, settings: Settings) -> Float | None:
@@ -54,8 +88,8 @@ def residuals(
     seen: Observabilities,
     weights: Float | None,
     settings: Settings,
-) -> tuple[Float, Float, np.ndarray]:
-    """Return rms of |f| - g after and before, m/s^2, shape (R,), and each sensor's outlying poses in words."""
+) -> PoseFits:
+    """Return the residuals of a batch of sensors, calibrated to K, gauge `lower`, and D."""
     g, real, poses = settings.g, batch.real, batch.count
     force = (batch.output - D[:, None]) @ np.linalg.inv(K).swapaxes(1, 2)
     size = np.linalg.norm(force, axis=2)
@@ -73,12 +107,22 @@ def residuals(
     sensor, pose = np.nonzero(is_suspect(far, size - g, freedom, g) & real)
     far[sensor, pose] = np.abs(leave_out(force[sensor], w[sensor], pose, g).studentised)
     outlying = beyond_chance(far, *(np.broadcast_to(a, far.shape) for a in (poses[:, None], freedom)))
-    words = np.full(len(poses), "", dtype=object)
+    names: list[list[str]] = [[] for _ in poses]
     for at in np.flatnonzero(outlying.any(axis=1)):
-        found = batch.pose[at, np.flatnonzero(outlying[at])]
-        more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
-        words[at] = ", ".join(readings.where(int(pose)) for pose in found[:NAMED]) + more
-    return rms, rms_before, words
+        found = np.flatnonzero(outlying[at])
+        if poses[at] > KEPT:  # as in a single calibration
+            found = np.sort(found[np.argsort(-np.abs(scaled[at, found]))[:KEPT_WORST]])
+        names[at] = [readings.where(int(pose)) for pose in batch.pose[at, found]]
+    return PoseFits(rms, rms_before, names, _explained(batch, unit, K))
+
+
+def _explained(batch: Batch, unit: Float, K: Float) -> Float:
+    """Return the variance of a pose that the scatter within poses explains, (m/s^2)^2, shape (R,), NaN if not known."""
+    if batch.scatter is None or batch.behind is None:
+        return np.full(len(K), np.nan)
+    variance = explained(unit, batch.scatter, batch.behind, np.einsum("rii->ri", K))
+    mean: Float = np.sum(np.where(batch.real, variance, 0.0), axis=1) / batch.count
+    return mean
 
 
 def reasons(

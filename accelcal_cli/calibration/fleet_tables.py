@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +18,9 @@ SHOWN = 10
 
 WORST = 5
 """Sensors with the largest rms that the summary names."""
+
+CLAUSE = re.compile(r"[:.] ")
+"""Where the first clause of a caution ends."""
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 VERDICTS = ("good", "weak", "undetermined", FAILED)
@@ -47,20 +51,23 @@ def sensors(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout]) -> T
         Column("outlying poses", key="outlying_poses"),
         Column("stands out", key="stands_out"),
         Column("reason"),
+        Column("caution"),
     )
     lists = (
         [labels, fleet.verdict.tolist(), fleet.poses.tolist()]
         + [values.tolist() for _, values in numbers]
-        + [fleet.outlying.tolist(), apart.tolist(), fleet.reason.tolist()]
+        + [fleet.outlying.tolist(), apart.tolist(), fleet.reason.tolist(), fleet.caution.tolist()]
     )
     return Table("Sensors", columns, tuple(zip(*lists, strict=True)))
 
 
 def counts(fleet: Fleet) -> str:
-    """Return how many sensors there are of each verdict, in words."""
+    """Return how many sensors there are of each verdict, and how many with a caution, in words."""
     each = {word: int((fleet.verdict == word).sum()) for word in VERDICTS}
     listed = ", ".join(f"{n:,} {word}" for word, n in each.items() if n)
-    return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}"
+    warned = int((fleet.caution != "").sum())
+    beside = f", {warned:,} of them with a caution" if warned else ""
+    return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{beside}"
 
 
 def summary(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: float) -> list[Table]:
@@ -68,6 +75,9 @@ def summary(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: f
     tables = []
     if fleet.determined.any():
         tables += [_spread(fleet, g), _worst(fleet, labels, g)]
+    warned = np.flatnonzero(fleet.caution != "")
+    if len(warned):
+        tables.append(_warned(fleet, labels, warned, g))
     if found:
         tables.append(_apart(labels, found))
     bad = np.flatnonzero(fleet.verdict != "good")
@@ -161,6 +171,25 @@ def _apart(labels: Sequence[str], found: Sequence[Standout]) -> Table:
     if len(found) > SHOWN:
         notes.append(f"And {len(found) - SHOWN:,} more (column stands_out of --format csv).")
     return Table("Stand out from the fleet", columns, rows, tuple(notes))
+
+
+def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table:
+    """Return the sensors with cautions, the noisiest first; of each its first caution in short."""
+    order = warned[np.argsort(-np.nan_to_num(fleet.s[warned]), kind="stable")][:SHOWN]
+    rows = tuple(
+        (labels[r], 100.0 * float(fleet.s[r]) / g, fleet.outlying[r], CLAUSE.split(fleet.caution[r])[0])
+        for r in order
+    )
+    notes = ["s: standard deviation of a pose. Whole sentences: column caution of --format csv."]
+    if len(warned) > SHOWN:
+        notes.append(f"And {len(warned) - SHOWN:,} more.")
+    columns = (
+        Column("sensor"),
+        Column("s", "% of g", ".3g"),
+        Column("outlying poses"),
+        Column("caution"),
+    )
+    return Table("Cautions", columns, rows, tuple(notes))
 
 
 def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:

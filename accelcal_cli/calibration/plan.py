@@ -9,6 +9,7 @@ import numpy as np
 from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.planner import best_poses, candidates
 from accelcal_cli.calibration.quality import PARAMETERS, Observability, design
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.sensor import units
 from accelcal_cli.sensor.poses import describe
 from accelcal_cli.streams import Float
@@ -25,6 +26,9 @@ KINDS = (
 SHORT = {"scale": "scale", "misalignment": "misal.", "bias": "bias"}
 """Headings of the kinds, short enough for all of them to stand side by side."""
 
+SO_FAR = ("verdict", "reasons", "cautions")
+"""What a plan says of the calibration so far, as `calibrate` does."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -35,20 +39,36 @@ class Plan:
         directions: unit specific force of the next, best first, shape (k, 3).
         seen: what the poses determine before the first of them and after each, k + 1 entries.
         noise: standard deviation of one pose in parts of g; None when not known.
+        so_far: the calibration of the poses that have been taken; None when there are none.
     """
 
     poses: int
     directions: Float
     seen: tuple[Observability, ...]
     noise: float | None
+    so_far: Calibration | None = None
 
     @property
     def verdict(self) -> str:
         """What the verdict will be after the last pose."""
-        return self.seen[-1].verdict
+        return "undetermined" if self.beyond_poses else self.seen[-1].verdict
+
+    @property
+    def beyond_poses(self) -> bool:
+        """Whether the calibration so far is undetermined for another reason than its poses: more do not mend it."""
+        if self.so_far is None or self.so_far.verdict != "undetermined":
+            return False
+        return self.seen[0].verdict != "undetermined"
 
 
-def plan(information: Float, poses: int, count: int, fixture: str, noise: float | None) -> Plan:
+def plan(
+    information: Float,
+    poses: int,
+    count: int,
+    fixture: str,
+    noise: float | None,
+    so_far: Calibration | None = None,
+) -> Plan:
     """Return the next `count` poses that shrink the worst sigma most.
 
     Args:
@@ -57,13 +77,14 @@ def plan(information: Float, poses: int, count: int, fixture: str, noise: float 
         count: how many to add.
         fixture: one of planner.FIXTURES.
         noise: standard deviation of one pose in parts of g; None when not known.
+        so_far: the calibration of the poses so far, whose verdict the plan carries on.
     """
     allowed = candidates(fixture)
     directions = allowed[best_poses(information, allowed, count)]
     rows = design(directions)
     sums = [information + rows[:k].T @ rows[:k] for k in range(count + 1)]
     seen = tuple(Observability.of(total, poses + k) for k, total in enumerate(sums))
-    return Plan(poses, directions, seen, noise)
+    return Plan(poses, directions, seen, noise, so_far)
 
 
 def pose_table(found: Plan) -> Table:
@@ -117,12 +138,17 @@ def record(found: Plan) -> dict[str, object]:
     return {
         "verdict": found.verdict,
         "noise": found.noise,
+        "so_far": None if found.so_far is None else {key: getattr(found.so_far, key) for key in SO_FAR},
         "poses": [dict(row) for row in pose_table(found).records()],
         "parameters": [dict(row) for row in parameter_table(found).records()],
     }
 
 
 def _notes(found: Plan) -> tuple[str, ...]:
+    if found.beyond_poses:
+        return (
+            "More poses do not mend the verdict on those so far; the plan only tells what they would add.",
+        )
     if found.verdict != "undetermined":
         return ()
     lost = found.seen[-1].above(quality.UNDETERMINED)

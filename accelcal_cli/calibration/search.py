@@ -76,6 +76,16 @@ def rounding(problem: Loetters) -> float:
     return float(ROUNDING * problem.triangle.poses.max() * problem.g**4)
 
 
+def to_gain(solution: Solution) -> float:
+    """Return the part of the cost that a Gauss-Newton step is expected to take off, 0 where only rounding is left."""
+    problem, x = solution.problem, solution.x[:, None]
+    if solution.cost <= rounding(problem):
+        return 0.0
+    residual, slope = problem.residuals(x)[0, 0], problem.jacobian(x)[0, 0]
+    step = np.linalg.lstsq(slope, residual)[0]
+    return float(np.sum((slope @ step) ** 2) / np.sum(residual**2))
+
+
 def polish(problem: Loetters, x: Float) -> Run:
     """Return Levenberg-Marquardt runs from x, shape (R, D), inside the box."""
     solver = OPTIMIZERS.get("levenberg-marquardt")()

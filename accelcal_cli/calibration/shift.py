@@ -12,7 +12,8 @@ from accelcal_cli.calibration.compress import compress
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS, Box, Loetters, pack
 from accelcal_cli.calibration.quality import UNDETERMINED, Observability
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.calibration.search import polish
+from accelcal_cli.calibration.search import model_at, polish
+from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.streams import Bool, Float
 
@@ -34,6 +35,8 @@ class Shift:
         basis: directions that the readings determine, shape (9, r).
         known: which parameters they determine one by one, shape (9,).
         noise: variance and degrees of freedom of the new readings.
+        model: the sensor that their residuals are seen with, gauge `lower`; step: what the residuals are still to be
+            moved by, to first order, m/s^2, shape (9,): none where the model is fitted to them.
     """
 
     value: Float
@@ -41,6 +44,8 @@ class Shift:
     basis: Float
     known: Bool
     noise: Noise
+    model: ErrorModel
+    step: Float
 
 
 def shift(old: Calibration, readings: Readings) -> Shift:
@@ -58,12 +63,14 @@ def shift(old: Calibration, readings: Readings) -> Shift:
         rest = float(e @ e - (basis.T @ J.T @ e) ** 2 @ (1.0 / values))
         freedom = readings.poses - int(seen.sum())
         known = np.einsum("pq,pq->p", basis, basis) > 1.0 - TOUCH**2
-        return Shift(value, inverse, basis, known, Noise(max(rest, 0.0) / max(freedom, 1), freedom))
+        noise = Noise(max(rest, 0.0) / max(freedom, 1), freedom)
+        return Shift(value, inverse, basis, known, noise, old.model.in_gauge("lower"), value)
     x = polish(problem, start).x
     variance = float(problem.cost(x[:, None])[0, 0]) / (4.0 * old.g**2) / max(readings.poses - 9, 1)
     cofactor = Observability.of(quality.information(problem, x)[0], readings.poses).cofactor
     value = _between(problem, start, x)
-    return Shift(value, cofactor, np.eye(9), np.ones(9, bool), Noise(variance, readings.poses - 9))
+    noise = Noise(variance, readings.poses - 9)
+    return Shift(value, cofactor, np.eye(9), np.ones(9, bool), noise, model_at(problem, x), np.zeros(9))
 
 
 def _problem(old: Calibration, readings: Readings) -> Loetters:

@@ -12,7 +12,9 @@ import numpy as np
 
 from accelcal_cli import __version__
 from accelcal_cli.calibration import chances
+from accelcal_cli.calibration import doubts as hidden
 from accelcal_cli.calibration import record as records
+from accelcal_cli.calibration.cautions import ratio_in_words
 from accelcal_cli.calibration.chances import Pair
 from accelcal_cli.calibration.quality import PARAMETERS
 from accelcal_cli.calibration.residuals import modulus_errors, square_error
@@ -54,7 +56,8 @@ class Verification:
     """The outcome of a comparison. Units: m/s^2 (units of g when g = 1).
 
     Attributes:
-        verdict: unchanged or changed; `reasons` says why in sentences.
+        verdict: unchanged, changed or inconclusive; `reasons` says why in sentences.
+        cautions: what speaks against the new readings, in sentences.
         chance: that an unchanged sensor looks as different; level: below it the sensor has changed.
         chi_square: d^T C^-1 d of the determined directions; directions: how many, at most nine; chance_together:
             of so large a chi-square when nothing changed.
@@ -68,6 +71,7 @@ class Verification:
 
     verdict: str
     reasons: tuple[str, ...]
+    cautions: tuple[str, ...]
     chance: float
     level: float
     chi_square: float
@@ -122,12 +126,19 @@ def verify(
     readings, warmth = _at_reference(old, readings)
     found = shift(old, readings)
     tests = Tests.of(old, found)
-    verdict = "changed" if tests.chance < level else "unchanged"
+    doubts = hidden.doubts(old, tests.pair, readings)
+    verdict = _verdict(tests.chance, level, doubts, readings)
     differences = _differences(found, tests, level if verdict == "changed" else 0.0)
     rms = _rms(old, readings)
     return Verification(
         verdict=verdict,
-        reasons=(*_strange(rms, old), *_reasons(verdict, differences, found, tests.pair, level), *warmth),
+        reasons=(
+            *_strange(rms, old),
+            *_reasons(verdict, differences, found, tests.pair, level),
+            *(doubts if verdict == "inconclusive" else ()),
+            *warmth,
+        ),
+        cautions=hidden.cautions(old, found, tests.pair, readings, verdict),
         chance=tests.chance,
         level=level,
         chi_square=tests.chi_square,
@@ -146,6 +157,14 @@ def verify(
         result=dict(old.data),
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
     )
+
+
+def _verdict(chance: float, level: float, doubts: tuple[str, ...], readings: Readings) -> str:
+    """Return the verdict; where there are doubts a change has to be certain, and of rows that are no poses none is."""
+    if doubts:
+        certain = chance < min(level, hidden.SURELY) and not readings.cautions
+        return "changed" if certain else "inconclusive"
+    return "changed" if chance < level else "unchanged"
 
 
 def _rms(old: Calibration, readings: Readings) -> float:
@@ -224,7 +243,7 @@ def _reasons(
     if found.noise.freedom < 1:
         lines.append("The new readings say nothing of their noise; it is taken to be that of the result.")
     elif pair.noise_chance() < level:
-        ratio = float(np.sqrt(pair.b.variance / pair.a.variance))
+        times = ratio_in_words(float(np.sqrt(pair.b.variance / pair.a.variance)))
         likely = f"chance {pair.noise_chance():.2g}"
-        lines.append(f"The new readings have {ratio:.2g} times the noise of the old ({likely}).")
+        lines.append(f"The new readings have {times} times the noise of the old ({likely}).")
     return tuple(lines)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import detecting, options
+from accelcal_cli.cli import detecting, options, pipes
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -138,19 +138,23 @@ def command(
     else:
         readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     result = calibrate(readings, settings)
-    _show(result, format, output, quiet)
-    if format != "table" or output == "-":  # the table shows them itself
-        options.caution(data, result.cautions, quiet)
-    if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
-        typer.echo(
-            f"accelcal: g = {settings.g} assumed; state yours with --g or --latitude and --height "
-            f"(scale factors are proportional to it){_units_of_g(result)}",
-            err=True,
-        )
-    if tolerance is not None and not result.rms <= tolerance:
-        typer.echo(f"accelcal: rms {result.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
-        raise typer.Exit(BAD_VERDICT)
-    if result.verdict == "undetermined":
+    missed = tolerance is not None and not result.rms <= tolerance
+    with pipes.even_if_unread():
+        _show(result, format, output)
+    with pipes.even_if_unread(sys.stderr):
+        if output not in (None, "-") and not quiet:
+            typer.echo(f"accelcal: wrote {output}", err=True)
+        if format != "table" or output == "-":  # the table shows them itself
+            options.caution(data, result.cautions, quiet)
+        if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
+            typer.echo(
+                f"accelcal: g = {settings.g} assumed; state yours with --g or --latitude and --height "
+                f"(scale factors are proportional to it){_units_of_g(result)}",
+                err=True,
+            )
+        if tolerance is not None and missed:
+            typer.echo(f"accelcal: rms {result.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
+    if missed or result.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
 
 
@@ -174,7 +178,7 @@ def _check_output(output: str | None, format: str) -> None:
     check_target(output)
 
 
-def _show(result: Calibration, format: str, output: str | None, quiet: bool) -> None:
+def _show(result: Calibration, format: str, output: str | None) -> None:
     """Write the result file, then print the result in the chosen form."""
     from accelcal_cli.output.plain import json_text, write_csv
 
@@ -197,6 +201,3 @@ def _show(result: Calibration, format: str, output: str | None, quiet: bool) -> 
         from accelcal_cli.output.calibration import show_calibration
 
         show_calibration(result)
-    sys.stdout.flush()
-    if output is not None and not quiet:
-        typer.echo(f"accelcal: wrote {output}", err=True)

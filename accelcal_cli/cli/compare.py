@@ -122,7 +122,9 @@ def command(
             "--scheme": scheme,
             "--noise": noise,
         }
-        source = _recorded(data, columns, [option for option, value in stated.items() if value is not None])
+        source = _recorded(
+            data, columns, space.g, [option for option, value in stated.items() if value is not None]
+        )
     study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
     records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     _show(study, records, format)
@@ -168,7 +170,7 @@ def _simulated(
     return Simulation(device, not fixed, count, scheme, device.noise if noise is None else noise)
 
 
-def _recorded(data: str, columns: str | None, simulation: Sequence[str]) -> Recording:
+def _recorded(data: str, columns: str | None, g: float, simulation: Sequence[str]) -> Recording:
     from accelcal_cli.sensor.readings import read_readings
     from accelcal_cli.studies.scene import Recording
 
@@ -176,7 +178,7 @@ def _recorded(data: str, columns: str | None, simulation: Sequence[str]) -> Reco
         raise UsageError(f"{', '.join(simulation)}: not with a file of readings, which are not simulated")
     options.check_input(data)
     chosen = None if columns is None else [part.strip() for part in columns.split(",")]
-    return Recording.of(read_readings(data, chosen, stdin=sys.stdin.buffer))
+    return Recording.of(read_readings(data, chosen, stdin=sys.stdin.buffer), g)
 
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:

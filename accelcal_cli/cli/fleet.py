@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import options, pipes
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from accelcal_cli.calibration.fleet import Fleet
     from accelcal_cli.calibration.settings import Settings
     from accelcal_cli.sensor.fleet import FleetReadings
+    from accelcal_cli.streams import Bool
 
 BAD_VERDICT = 1
 SUFFIXES = (".csv", ".parquet", ".json")
@@ -92,11 +93,16 @@ def command(
         fleet = _with_results(readings, settings, output)
     else:
         fleet = calibrate_fleet(readings, settings)
-    _show(fleet, readings, settings, format, None if folder else output)
-    if not quiet:
-        assumed = stated_g is None and settings.g == STANDARD_GRAVITY
-        _tell(readings, output, settings.g if assumed else None)
-    _judge(fleet, readings.sensors, tolerance)
+    with pipes.even_if_unread():
+        _show(fleet, readings, settings, format, None if folder else output)
+    bad = _bad(fleet, tolerance)
+    with pipes.even_if_unread(sys.stderr):
+        if not quiet:
+            assumed = stated_g is None and settings.g == STANDARD_GRAVITY
+            _tell(readings, output, settings.g if assumed else None)
+        _name(bad, readings.sensors)
+    if any(which.any() for which in bad.values()):
+        raise typer.Exit(BAD_VERDICT)
 
 
 def _check_output(output: str) -> bool:
@@ -144,7 +150,6 @@ def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str
     else:
         tables = fleet_tables.summary(fleet, readings.sensors, found, settings.g)
         shown.show_fleet(fleet_tables.counts(fleet), tables)
-    sys.stdout.flush()
 
 
 def _tell(readings: FleetReadings, output: str | None, assumed: float | None) -> None:
@@ -161,16 +166,19 @@ def _tell(readings: FleetReadings, output: str | None, assumed: float | None) ->
         typer.echo(f"accelcal: {note}", err=True)
 
 
-def _judge(fleet: Fleet, labels: Sequence[str], tolerance: float | None) -> None:
-    """Name the sensors that are not determined or too far off, and exit 1 if there are any."""
+def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:
+    """Return which sensors are not determined or too far off, shape (R,) each, by what they are."""
     kinds = {"undetermined or failed": ~fleet.determined}
     if tolerance is not None:  # A sensor that failed has no rms; it is named already.
         kinds[f"with an rms above the tolerance {tolerance:.6g}"] = fleet.rms > tolerance
-    for what, which in kinds.items():
+    return kinds
+
+
+def _name(bad: Mapping[str, Bool], labels: Sequence[str]) -> None:
+    """Name the sensors that are bad on standard error."""
+    for what, which in bad.items():
         names = [labels[r] for r in which.nonzero()[0].tolist()]
         if names:
             more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
             count = f"{len(names):,} of {len(labels):,} sensors"
             typer.echo(f"accelcal: {count} {what}: {', '.join(names[:NAMED])}{more}", err=True)
-    if any(which.any() for which in kinds.values()):
-        raise typer.Exit(BAD_VERDICT)

@@ -9,13 +9,14 @@ import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.core
 import typer.main
 
 from accelcal_cli import __version__
+from accelcal_cli.cli import pipes
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -139,7 +140,7 @@ def main() -> None:
     except OSError as error:
         if error.errno == errno.EPIPE:
             _leave_pipe()
-        _drop(sys.stdout)
+        pipes.drop(sys.stdout)
         _fail(f"cannot write: {(error.strerror or str(error)).lower()}", BAD_INPUT)
     except MemoryError:
         _fail("not enough memory for this input", BAD_INPUT)
@@ -172,16 +173,11 @@ def _fail(message: str, code: int) -> NoReturn:
     try:
         typer.echo(f"accelcal: {message}", err=True)
     except OSError:  # a terminal that is gone
-        _drop(sys.stderr)
+        pipes.drop(sys.stderr)
     sys.exit(code)
 
 
 def _leave_pipe() -> NoReturn:
     """Leave quietly when the reader of our output has gone, as `head` does."""
-    _drop(sys.stdout)
+    pipes.drop(sys.stdout)
     sys.exit(0)
-
-
-def _drop(stream: TextIO) -> None:
-    """Lead what is still buffered for a stream nowhere, or Python would complain of it at its exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

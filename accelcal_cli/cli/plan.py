@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import options, pipes
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -77,30 +78,42 @@ def command(
     if poses is not None and add is not None:
         raise UsageError("--poses and --add: expected one of them, not both")
     stated_g = options.gravity(g, latitude, height)
-    so_far = _so_far(data, columns, stated_g, quiet) if data is not None else None
+    so_far = _so_far(data, columns, stated_g) if data is not None else None
     found = _plan(so_far, poses, add, fixture, noise, stated_g)
-    _show(found, format)
+    with pipes.even_if_unread():
+        _show(found, format)
+    with pipes.even_if_unread(sys.stderr):
+        if so_far is not None and format != "table":  # the table shows them itself
+            options.caution(str(data), so_far.cautions, quiet)
     if found.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
 
 
-def _so_far(data: str, columns: str | None, g: float | None, quiet: bool) -> Calibration:
+def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.pipeline import calibrate
-    from accelcal_cli.config import load_result, load_settings
+    from accelcal_cli.config import is_result, load_result, load_settings
     from accelcal_cli.sensor.readings import read_readings
 
-    if Path(data).suffix in RESULTS:
+    options.check_input(data)
+    stdin = io.BufferedReader(cast("Any", sys.stdin.buffer)) if data == "-" else None
+    if Path(data).suffix in RESULTS or (stdin is not None and is_result(_head(stdin))):
         if columns is not None or g is not None:
             raise UsageError(
                 f"{data}: a result file has its own columns and g; leave out --columns, --g and --latitude"
             )
-        return load_result(data)
-    options.check_input(data)
+        return load_result(data if stdin is None else "<stdin>", stdin)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
-    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
-    options.caution(readings.source, readings.cautions, quiet)
+    readings = read_readings(data, options.split_columns(columns), stdin=stdin)
     return calibrate(readings, settings)
+
+
+def _head(stdin: io.BufferedReader) -> bytes:
+    """Return how standard input begins; nothing where it cannot be read, which the reader of it will say."""
+    try:
+        return stdin.peek()
+    except OSError:
+        return b""
 
 
 def _plan(
@@ -127,7 +140,8 @@ def _plan(
         return plan(np.zeros((9, 9)), 0, count, fixture, None if noise is None else noise / local_g)
     known = so_far.s if so_far.freedom > 0 and so_far.s > 0 else None
     sigma = noise or known
-    return plan(so_far.information, taken, count, fixture, None if sigma is None else sigma / so_far.g)
+    part = None if sigma is None else sigma / so_far.g
+    return plan(so_far.information, taken, count, fixture, part, so_far)
 
 
 def _show(found: Plan, format: str) -> None:
@@ -142,8 +156,11 @@ def _show(found: Plan, format: str) -> None:
         from accelcal_cli.output import console
 
         out = console.console()
+        known = found.so_far
+        if known is not None and (known.cautions or found.beyond_poses):
+            console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
+            out.print()
         console.show_split(pose_table(found), out)
         expected = parameter_table(found)
         if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
             console.show([expected], out)
-    sys.stdout.flush()

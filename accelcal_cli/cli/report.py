@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import options, pipes
 from accelcal_cli.errors import UsageError
 
 SUFFIXES = (".html", ".htm")
@@ -39,11 +40,10 @@ def command(
     found = options.load_result(result)
     source = Path(str(found.data.get("source", result))).name
     text = page(found, title or f"Calibration of {source}")
-    with whole_file(
-        output, binary=True
-    ) as file:  # the page says that it is UTF-8, whatever the terminal takes
-        file.write(text.encode())
-    if not quiet and output != "-":
-        typer.echo(f"accelcal: wrote {output}", err=True)
+    with pipes.even_if_unread(), whole_file(output, binary=True) as file:
+        file.write(text.encode())  # the page says that it is UTF-8, whatever the terminal takes
+    with pipes.even_if_unread(sys.stderr):
+        if not quiet and output != "-":
+            typer.echo(f"accelcal: wrote {output}", err=True)
     if found.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
+from accelcal_cli.cli import options, pipes
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ def command(
     """Say whether a sensor has changed since it was calibrated.
 
     Compares the result with new readings: a chi-square test of all nine parameters, each of them alone, and the rms
-    of |f| - g against a tolerance. Exit code 1 means that the sensor has changed or that --tolerance was missed.
+    of |f| - g against a tolerance. Exit code 1 means that the sensor has changed, that these readings cannot tell, or
+    that --tolerance was missed.
     """
     from accelcal_cli.calibration.verify import verify
     from accelcal_cli.sensor.readings import read_readings
@@ -50,11 +51,15 @@ def command(
     old = options.load_result(result, data)
     _check_gravity(g, old, result)
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
-    options.caution(readings.source, readings.cautions, quiet)
     found = verify(old, readings, level, tolerance)
-    _show(found, format)
-    if not found.within and not quiet:
-        typer.echo(f"accelcal: rms {found.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
+    with pipes.even_if_unread():
+        _show(found, format)
+    with pipes.even_if_unread(sys.stderr):
+        options.caution(result, old.cautions, quiet)
+        if format != "table":  # the table shows them itself
+            options.caution(readings.source, found.cautions, quiet)
+        if not found.within and not quiet:
+            typer.echo(f"accelcal: rms {found.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
     if not found.passed:
         raise typer.Exit(FAILED)
 
@@ -80,4 +85,3 @@ def _show(found: Verification, format: str) -> None:
         from accelcal_cli.output.verification import show_verification
 
         show_verification(found)
-    sys.stdout.flush()

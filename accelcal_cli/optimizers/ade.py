@@ -43,7 +43,8 @@ class AdaptiveEvolution(Optimizer):
     crossover_min: float = setting(0.0, "CR of the worst mutant (CR_min)", low=0, high=1)
     crossover_max: float = setting(1.0, "CR of the best mutant (CR_max)", low=0, high=1)
     difference: Literal["best", "random"] = setting(
-        "random", "best: F (best - m_r) as the paper's text reads; random: + F (m_r1 - m_r2), current-to-best/1"
+        "random",
+        "best: F (best - m_r) as the paper's text reads; random: + F (m_r1 - m_r2), current-to-best/1",
     )
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> State:

@@ -23,6 +23,7 @@ VERDICT_STYLE = {
     "undetermined": "bold red",
     "unchanged": "bold green",
     "changed": "bold red",
+    "inconclusive": "bold yellow",
 }
 
 
@@ -144,9 +145,11 @@ def _drawn(table: Table, out: Console) -> Text:
     return Text.assemble((head, "bold"), "\n", body, no_wrap=True, overflow="ignore")
 
 
-def verdict(word: str, sentences: Iterable[str], out: Console, cautions: Iterable[str] = ()) -> None:
+def verdict(
+    word: str, sentences: Iterable[str], out: Console, cautions: Iterable[str] = (), title: str = "Verdict"
+) -> None:
     """Print the verdict, what it rests on, and what it does not look at."""
-    out.print(Text.assemble(("Verdict: ", "bold"), (word, VERDICT_STYLE.get(word, "bold"))))
+    out.print(Text.assemble((f"{title}: ", "bold"), (word, VERDICT_STYLE.get(word, "bold"))))
     for sentence in sentences:
         out.print(Text(f"  {sentence}"))
     for caution in cautions:

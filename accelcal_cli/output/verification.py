@@ -10,7 +10,7 @@ from accelcal_cli.output import console as rich_console
 def show_verification(result: Verification) -> None:
     """Print a verification to standard output."""
     out = rich_console.console()
-    rich_console.verdict(result.verdict, result.reasons, out)
+    rich_console.verdict(result.verdict, result.reasons, out, result.cautions)
     out.print()
     rich_console.show_split(differences(result), out)
     rich_console.show([evidence(result)], out)

@@ -10,18 +10,12 @@ from numpy.typing import NDArray
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.cells import Rows
 from accelcal_cli.sensor.columns import Columns
-from accelcal_cli.sensor.doubts import doubts
+from accelcal_cli.sensor.doubts import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.sensor.repeats import LabelledMeans
 from accelcal_cli.sensor.spool import IN_MEMORY, RowStore
 
 Floats = NDArray[np.float64]
 STUCK = 1_000_000  # equal readings in a row after which an input is not read on
-
-RAW_ROWS = 500
-"""Rows with a time each, or each much like the one before, from which on they are rather a raw log than poses."""
-
-ALIKE, LOOKED_AT = 0.05, 4096
-"""Poses are turned from one to the next; most of the first rows of a log differ by less than this part of the range."""
 
 
 @dataclass
@@ -129,22 +123,13 @@ class Collector:
             self.notes.append(f"columns beside the readings not used: more than {IN_MEMORY:,} poses")
 
     def _by_row(self) -> Extras:
-        if self.store.rows >= RAW_ROWS and (self.columns.time is not None or self._creeps()):
-            self.cautions.append(
-                f"Each row is taken for a pose at rest. If these {self.store.rows:,} rows are a log with moves in it, "
-                "find its poses with accelcal detect, or calibrate with --raw; of many readings of one pose, label the "
-                "poses in a column."
-            )
+        _, first = next(iter(self.store.blocks(LOOKED_AT)), (0, np.zeros((0, 3))))
+        span = float((self.extent.upper - self.extent.lower).max())
+        self.cautions += log_cautions(self.store.rows, first, span, timed=self.columns.time is not None)
         if not self._extras:
             return Extras()
         count, scatter, others = self._split(np.concatenate(self._extras))
         return Extras(None, count, scatter, *self._others(others))
-
-    def _creeps(self) -> bool:
-        """Whether most of the first rows are much like the row before."""
-        _, first = next(iter(self.store.blocks(LOOKED_AT)))
-        steps = np.abs(np.diff(first, axis=0)).max(axis=1)
-        return bool(np.median(steps) < ALIKE * (self.extent.upper - self.extent.lower).max())
 
     def _by_label(self, means: LabelledMeans[str]) -> Extras:
         if len(means.rows):

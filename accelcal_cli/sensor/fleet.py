@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from accelcal_cli.sensor.doubts import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.sensor.spool import RowStore
 from accelcal_cli.streams import Bool, Float, Int
@@ -32,6 +33,7 @@ class Origin:
         first: number of its first pose among those of all tables.
         where: how to name one of its poses, counted from 0.
         notes: what the reader did that a user should know.
+        rows: whether each row is taken for a pose, not each label; timed: whether they have times.
     """
 
     name: str
@@ -40,6 +42,8 @@ class Origin:
     first: int
     where: Callable[[int], str]
     notes: tuple[str, ...]
+    rows: bool
+    timed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +119,22 @@ class FleetReadings:
             scatter=_known(batch.scatter, at, count),
         )
         return readings.known_as(
-            origin.sha256, origin.columns, origin.notes, lambda pose: self.where(int(poses[pose]))
+            origin.sha256,
+            origin.columns,
+            origin.notes,
+            lambda pose: self.where(int(poses[pose])),
+            self.cautions(batch, at),
         )
+
+    def cautions(self, batch: Batch, at: int) -> tuple[str, ...]:
+        """Return why the readings of the sensor at `at` in a batch may be no poses, in sentences."""
+        origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
+        first = output[:LOOKED_AT]
+        log: tuple[str, ...] = ()
+        if origin.rows:
+            span = float(np.ptp(output, axis=0).max())
+            log = log_cautions(len(output), first, span, timed=origin.timed)
+        return (*log, *doubts(first, origin.columns))
 
     def batches(self) -> Iterator[Batch]:
         """Yield every sensor once, in batches of about equally many poses."""

@@ -109,7 +109,18 @@ class _Gathering:
             codes = np.array([code for code, _ in keys], dtype=np.intp)
             self._add(codes, means.mean, means.count(), means.scatter())
             where = _by_label([label for _, label in keys])
-        self.origins.append(Origin(table.name, table.sha256, columns.names, first, where, columns.notes))
+        self.origins.append(
+            Origin(
+                table.name,
+                table.sha256,
+                columns.names,
+                first,
+                where,
+                columns.notes,
+                rows=means is None,
+                timed=columns.time is not None,
+            )
+        )
 
     def _codes(self, labels: Sequence[str]) -> Int:
         """Return the numbers of sensors, shape (B,), by their labels; a new one gets the next."""

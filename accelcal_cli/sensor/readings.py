@@ -87,10 +87,16 @@ class Readings:
         return cls._of(collector, extras, hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest(), None)
 
     def known_as(
-        self, sha256: str, columns: tuple[str, str, str], notes: Sequence[str], where: Callable[[int], str]
+        self,
+        sha256: str,
+        columns: tuple[str, str, str],
+        notes: Sequence[str],
+        where: Callable[[int], str],
+        cautions: tuple[str, ...] | None = None,
     ) -> Self:
-        """Return the same poses with the origin of the input that they were taken from."""
-        return replace(self, sha256=sha256, columns=columns, notes=tuple(notes), _line=where)
+        """Return the same poses with the origin of the input that they were taken from, and its cautions if stated."""
+        own = self.cautions if cautions is None else cautions
+        return replace(self, sha256=sha256, columns=columns, notes=tuple(notes), cautions=own, _line=where)
 
     @classmethod
     def _of(

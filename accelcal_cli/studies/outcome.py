@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,11 +26,28 @@ def summary(study: Comparison, records: Sequence[Record], only_successful: bool 
         only_successful: leave the runs that failed out of all but the success rate.
     """
     rows = []
+    records = judged(study, records)
     for cell, entry in enumerate(study.entries):
         own = [r for r in records if r.cell == cell]
         if own:
             rows.append((entry.label, *_row(study, own, only_successful)))
     return Table("Comparison", COLUMNS, tuple(rows), notes=(*_notes(study), *_missed(rows)))
+
+
+def judged(study: Comparison, records: Sequence[Record]) -> list[Record]:
+    """Return the records with the least cost that anything found on the same readings.
+
+    Levenberg-Marquardt from the truth ends in the nearest minimum; a search may have found a lower one.
+    """
+    alike = [0 if isinstance(study.source, Recording) else r.run for r in records]
+    least: dict[int, float] = {}
+    for which, r in zip(alike, records, strict=True):
+        found = [cost for cost in (r.values.get("least_cost"), r.cost) if cost is not None and cost >= 0.0]
+        least[which] = min((*found, least.get(which, np.inf)))
+    return [
+        replace(r, values={**r.values, "least_cost": least[which] if np.isfinite(least[which]) else None})
+        for which, r in zip(alike, records, strict=True)
+    ]
 
 
 def succeeded(study: Comparison, record: Record) -> bool:
@@ -40,18 +58,18 @@ def succeeded(study: Comparison, record: Record) -> bool:
 
 def _row(study: Comparison, own: Sequence[Record], only_successful: bool) -> tuple[object, ...]:
     good = [succeeded(study, r) for r in own]
-    judged = [r for r, g in zip(own, good, strict=True) if g or not only_successful]
-    hits = [r.hit for r in own if r.hit is not None]
+    counted = [r for r, g in zip(own, good, strict=True) if g or not only_successful]
+    hits = [r.hit for r, g in zip(own, good, strict=True) if g and r.hit is not None]
     return (
         len(own),
         sum(good) / len(own),
-        _median([r.seconds for r in judged]),
-        _count([r.evaluations for r in judged]),
+        _median([r.seconds for r in counted]),
+        _count([r.evaluations for r in counted]),
         _count(hits),
-        _median([r.cost for r in judged]),
-        _median([_excess(r) for r in judged]) if study.noisy else None,
-        *(_total(judged, name) for name in ERRORS),
-        _total(judged, "efficiency"),
+        _median([r.cost for r in counted]),
+        _median([_excess(r) for r in counted]) if study.noisy else None,
+        *(_total(counted, name) for name in ERRORS),
+        _total(counted, "efficiency"),
     )
 
 

@@ -15,9 +15,10 @@ from accelcal_cli.calibration.compress import Triangle, compress, compress_each
 from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
 from accelcal_cli.calibration.nominal import BOX_PURPOSE, SHIFT, half_widths
+from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.quality import information
 from accelcal_cli.calibration.search import polish
-from accelcal_cli.calibration.settings import BoxSettings
+from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 from accelcal_cli.sensor.poses import directions
@@ -70,15 +71,21 @@ class Recording:
     poses: int
 
     @classmethod
-    def of(cls, readings: Readings) -> Recording:
-        """Return readings as part of a study.
+    def of(cls, readings: Readings, g: float) -> Recording:
+        """Return readings as part of a study at a local gravity g, m/s^2.
 
         Raises:
-            DataError: fewer than nine poses.
+            DataError: fewer than nine poses, or readings that determine no sensor: their cost has no one minimum.
         """
         if readings.poses < FEWEST:
             raise DataError(
                 f"{readings.source}: {readings.poses} poses; nine parameters need at least {FEWEST}, better 12 or more"
+            )
+        found = calibrate(readings, Settings(optimizer="levenberg-marquardt", g=g))
+        if found.verdict == "undetermined":
+            raise DataError(
+                f"{readings.source}: there is no one least cost to compare with; accelcal calibrate calls these "
+                f"readings undetermined ({found.reasons[0].rstrip('.')})"
             )
         centre = 0.5 * (readings.lower + readings.upper)
         scale = 0.5 * float((readings.upper - readings.lower).max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from accelcal_cli.streams import Streams
 G = 9.81
 LM = Settings(optimizer="levenberg-marquardt", g=G)
 TYPE = Sensor(K_a=((100.0, 0, 0), (0, 100.0, 0), (0, 0, 100.0)), spread=Spread(0.02, 0.01, 0.3))
+LINE = re.compile(r"line \d+")
 SCHEMES = {
     "faces-edges": poses.faces_edges(),
     "turns": poses.turns(),
@@ -117,6 +119,7 @@ def test_every_sensor_is_calibrated_as_if_it_were_alone(mixed, tmp_path, setting
         assert fleet.poses[r] == one.poses
         words = " ".join(one.reasons)
         assert fleet.reason[r].split(" Poses that")[0].split(" The least cost")[0] in words
+        assert LINE.sub("", fleet.caution[r]) == LINE.sub("", " ".join(one.cautions))
         dop = np.array(list(one.dop.parameters.values()))
         if one.verdict == "undetermined":
             np.testing.assert_array_equal(np.isinf(fleet.dop[r]), np.isinf(dop))
@@ -146,6 +149,7 @@ def test_the_whole_records_are_those_of_calibrate(mixed, tmp_path):
     kept = {}
     fleet = calibrate_fleet(readings, LM, lambda number, record: kept.setdefault(number, record))
     assert sorted(kept) == [r for r in range(len(readings.sensors)) if fleet.verdict[r] != FAILED]
+    assert all(fleet.caution[number] == " ".join(record.cautions) for number, record in kept.items())
     r = readings.sensors.index("turns/0.001")
     alone = tmp_path / "alone.csv"
     alone.write_text(
@@ -308,6 +312,80 @@ def test_a_sensor_of_few_poses_may_be_farther_off(tmp_path):
     assert named == 0
 
 
+@pytest.fixture(scope="module")
+def clipped(tmp_path_factory):
+    """Thirty sensors; of number 7 the z axis stops at two thirds of g, of number 12 one pose slipped."""
+    tables = {f"S{k:02}": rows_of(poses.turns(), k) for k in range(30)}
+    tables["S07"] = np.minimum(tables["S07"], [np.inf, np.inf, 650.0])
+    tables["S12"] = tables["S12"] * np.where(np.arange(24) == 5, 1.01, 1.0)[:, None]
+    path = write(tmp_path_factory.mktemp("clipped") / "clipped.csv", tables)
+    return read_fleet([path]), tables
+
+
+def test_a_broken_sensor_has_the_cautions_of_calibrate(clipped, tmp_path):
+    readings, tables = clipped
+    kept = {}
+    fleet = calibrate_fleet(readings, LM, lambda number, record: kept.setdefault(number, record))
+    assert set(fleet.verdict) == {"good"}
+    assert [readings.sensors[r] for r in np.flatnonzero(fleet.caution != "")] == ["S07", "S12"]
+    for r, label in ((7, "S07"), (12, "S12")):
+        alone = tmp_path / "alone.csv"
+        alone.write_text("ax,ay,az\n" + "\n".join(",".join(map(repr, row)) for row in tables[label].tolist()))
+        one = calibrate(read_readings(alone), LM)
+        assert one.cautions
+        assert [LINE.sub("", text) for text in kept[r].cautions] == [
+            LINE.sub("", text) for text in one.cautions
+        ]
+        assert fleet.caution[r] == " ".join(kept[r].cautions)
+    assert "Beyond chance off the others: line 295" in fleet.caution[12]
+    assert counts(fleet) == "30 sensors: 30 good, 2 of them with a caution"
+    (table,) = [t for t in summary(fleet, readings.sensors, [], G) if t.title == "Cautions"]
+    assert [row[0] for row in table.rows] == ["S07", "S12"]
+    assert table.rows[0][1] == pytest.approx(100 * fleet.s[7] / G)
+    assert table.rows[0][3].startswith("After calibration one pose errs by ")
+    assert table.rows[0][3].endswith("is much for an accelerometer at rest")
+    assert table.rows[1][2:] == ("line 295", "Beyond chance off the others")
+    rows = sensors(fleet, readings.sensors, []).records()
+    assert [row["sensor"] for row in rows if row["caution"]] == ["S07", "S12"]
+
+
+@pytest.mark.parametrize("header", ["pose,ax,ay,az", "ax,ay,az", "time,ax,ay,az", "ax,ay,az,n,sx,sy,sz"])
+def test_cautions_of_scatter_and_of_logs_are_those_of_calibrate(tmp_path, header):
+    """Samples of each pose that say less than its error; 600 rows that creep, or have times; counts and deviations."""
+    u = np.repeat(poses.turns(), 25, axis=0)
+    fine = {"S1": noise(600, 0.01, 1), "S2": noise(600, 0.01, 2), "S3": noise(600, 0.01, 3)}
+    fine["S2"] += 0.05 * np.repeat(noise(24, 1.0, 4), 25, axis=0)
+    cells = []
+    for label, extra in fine.items():
+        rows = MEMS.output(G * u + extra)
+        if header.endswith("sz"):
+            rows = np.column_stack(
+                [rows.reshape(24, 25, 3).mean(axis=1), np.full((24, 4), [25, 0.01, 0.01, 0.01])]
+            )
+        if header[0] in "pt":
+            rows = np.column_stack(
+                [np.arange(600) // 25 if header[0] == "p" else 0.01 * np.arange(600), rows]
+            )
+        cells += [(label, ",".join(map(repr, row))) for row in rows.tolist()]
+    path = tmp_path / "many.csv"
+    path.write_text("\n".join([f"sensor,{header}", *(f"{label},{row}" for label, row in cells)]))
+    readings = read_fleet([str(path)])
+    kept = {}
+    fleet = calibrate_fleet(readings, LM, lambda number, record: kept.setdefault(number, record))
+    said = {}
+    for r, label in enumerate(readings.sensors):
+        alone = tmp_path / "alone.csv"
+        alone.write_text("\n".join([header, *(row for own, row in cells if own == label)]))
+        one = calibrate(read_readings(alone), LM)
+        said[label] = [LINE.sub("", text) for text in one.cautions]
+        assert [LINE.sub("", text) for text in kept[r].cautions] == said[label]
+        assert fleet.caution[r] == " ".join(kept[r].cautions)
+    scattered = any("what the scatter within the poses explains" in text for text in said["S2"])
+    assert scattered == (header[0] == "p" or header.endswith("sz"))
+    logged = any("600 rows are a log" in text for text in said["S1"])
+    assert logged == (header in ("ax,ay,az", "time,ax,ay,az"))
+
+
 def test_a_few_sensors_are_no_fleet_to_stand_out_from(tmp_path):
     tables = {f"S{k}": rows_of(poses.turns(), k) for k in range(9)}
     tables["S3"] *= 2.0
@@ -338,7 +416,7 @@ def test_the_summary_tells_what_is_wrong(mixed):
     readings = read_fleet([path])
     fleet = calibrate_fleet(readings, LM)
     tables = {t.title: t for t in summary(fleet, readings.sensors, [], G)}
-    assert list(tables) == ["Fleet", "Worst fit", "Not good"]
+    assert list(tables) == ["Fleet", "Worst fit", "Cautions", "Not good"]
     first = tables["Not good"].rows[0]
     assert first[1] == FAILED
     assert "only one pose" in first[2] or "equal" in first[2]

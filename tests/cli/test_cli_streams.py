@@ -49,6 +49,36 @@ def test_a_reader_that_leaves_is_no_error(shell, line):
 
 
 @pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("accelcal calibrate six.csv", 1),
+        ("accelcal calibrate six.csv -q -o -", 1),
+        ("accelcal calibrate good.csv --tolerance 1e-9 --format json", 1),
+        ("accelcal verify good.yaml moved.csv", 1),
+        ("accelcal verify good.yaml good.csv", 0),
+        ("accelcal fleet six.csv good.csv", 1),
+        ("accelcal fleet good.csv moved.csv --format csv --tolerance 1e-9", 1),
+        ("accelcal plan six.csv --add 1", 1),
+        ("accelcal report six.yaml -o -", 1),
+    ],
+)
+@pytest.mark.parametrize("gone", ["| true", "2>&1 | true", ">&- 2>&-", "> /dev/null"])
+def test_a_verdict_is_the_same_whoever_reads_it(shell, line, code, gone):
+    """A pipe whose reader has gone before anything is printed, for standard error too; closed streams; all is read."""
+    if "report" in line:
+        pytest.importorskip("jinja2")
+    shell(
+        "accelcal simulate --sensor mems --positions 6 > six.csv; accelcal calibrate six.csv -q -o six.yaml; "
+        "accelcal simulate --sensor mems --positions 24 > good.csv; accelcal calibrate good.csv -q -o good.yaml; "
+        "awk -F, -v OFS=, 'NR > 1 {$3 += 90} 1' good.csv > moved.csv"
+    )
+    outcome = shell(f"{line} {gone}; exit ${{PIPESTATUS[0]}}")
+    assert outcome.code == code
+    assert "Traceback" not in outcome.err
+    assert "Broken" not in outcome.err
+
+
+@pytest.mark.parametrize(
     ("stream", "parts"),
     [
         ("head -c 2G /dev/zero", ["<stdin>, line 1", "NUL"]),

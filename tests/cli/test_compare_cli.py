@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+from math import cos, sin
 
 import pytest
 
@@ -182,6 +183,10 @@ COMPARE = {
     "no such file": (["god.csv"], ["god.csv", "no such file"]),
     "file and simulation": (["good.csv", "--noise", "1", "--fixed"], ["--fixed, --noise", "not with a file"]),
     "columns without file": (["--columns", "1,2,3"], ["--columns", "needs a file"]),
+    "poses that determine no sensor": (
+        ["flat.csv"],
+        ["flat.csv: there is no one least cost", "undetermined (The"],
+    ),
     "too few poses": (["few.csv"], ["few.csv", "3 poses", "at least 9"]),
     "word in a cell": (["word.csv"], ["word.csv, line 3", '"oops" is not a number']),
 }
@@ -208,6 +213,8 @@ def refused(outcome, parts):
 @pytest.fixture
 def folder(good, tmp_path):
     (tmp_path / "few.csv").write_text("Nx,Ny,Nz\n1,0,0\n0,1,0\n0,0,1\n")
+    turns = [f"{cos(k)},{sin(k)},{0.001 * (k % 3)}" for k in range(15)]
+    (tmp_path / "flat.csv").write_text("\n".join(["Nx,Ny,Nz", *turns]))
     (tmp_path / "word.csv").write_text("Nx,Ny,Nz\n1,2,3\n4,oops,6\n")
     return tmp_path
 

@@ -70,22 +70,26 @@ def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
     plain = run("calibrate", log, "--optimizer", "ellipsoid", "-o", "wrong.yaml")
     assert said in plain.out.replace("\n", " ")
     assert said not in run("calibrate", log, "--raw", "--optimizer", "ellipsoid").out.replace("\n", " ")
-    assert run("verify", "wrong.yaml", log).err.startswith(f"accelcal: raw.csv: caution: {said}")
-    assert run("plan", log).err.startswith(f"accelcal: raw.csv: caution: {said}")
+    verified = run("verify", "wrong.yaml", log)
+    assert verified.err.startswith(f"accelcal: wrong.yaml: caution: {said}")
+    for outcome in (verified, run("plan", log)):
+        assert f"\nCaution: {said}" in outcome.out
+        assert "raw.csv" not in outcome.err
+    assert run("plan", log, "--format", "csv").err.startswith(f"accelcal: raw.csv: caution: {said}")
     assert run("detect", log, "-o", "poses.csv").code == 0
     assert said not in run("calibrate", "poses.csv", "--optimizer", "ellipsoid").out.replace("\n", " ")
-    assert run("plan", "poses.csv").err == ""
+    assert run("plan", "poses.csv", "--format", "csv").err == ""
 
 
 def test_a_raw_log_without_names_is_told_too_and_many_poses_are_not(run, log):
     bare = "".join(line.partition(",")[2] for line in Path(log).read_text().splitlines(keepends=True)[1:])
     said = "Each row is taken for a pose at rest. If these"
     Path("bare.csv").write_text(bare)
-    assert run("plan", "bare.csv", "--columns", "1,2,3").err.startswith(
+    assert run("plan", "bare.csv", "--columns", "1,2,3", "--format", "csv").err.startswith(
         f"accelcal: bare.csv: caution: {said}"
     )
     run("simulate", "--sensor", "mems", "--positions", "600", "-o", "poses.csv")
-    assert run("plan", "poses.csv").err == ""
+    assert run("plan", "poses.csv", "--format", "csv").err == ""
 
 
 def test_weights_of_a_raw_log_can_be_stated(run, log):

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 
+import numpy as np
 import pytest
 
 
@@ -59,6 +60,54 @@ def test_readings_may_come_through_a_pipe(run, faces, tmp_path):
     piped = run("plan", "-", "--format", "csv", stdin=(tmp_path / faces).read_bytes())
     assert piped.code == 0
     assert piped.out == run("plan", faces, "--format", "csv").out
+
+
+@pytest.mark.parametrize("name", ["r.yaml", "r.json"])
+def test_a_result_may_come_through_a_pipe(run, good, tmp_path, name):
+    assert run("calibrate", good, "-o", name, "-q").code == 0
+    text = (tmp_path / name).read_bytes()
+    for form in (
+        text,
+        b"\xef\xbb\xbf\n" + text,
+        b"# mine\n---\n" + text if name == "r.yaml" else b"\n" + text,
+    ):
+        piped = run("plan", "-", "--add", "2", "--format", "json", stdin=form)
+        assert (piped.code, piped.err) == (0, "")
+        assert piped.out == run("plan", name, "--add", "2", "--format", "json").out
+    refused = run("plan", "-", "--g", "9.81", stdin=text)
+    assert refused.code == 2
+    assert "a result file has its own columns and g" in refused.err
+
+
+def test_what_calibrate_says_of_the_poses_so_far_is_carried_on(run, tmp_path):
+    """Random numbers: their directions are many, but no sensor reads so."""
+    rows = np.random.default_rng(1).normal(size=(30, 3))
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",")
+    said = json.loads(run("calibrate", "r.csv", "--optimizer", "levenberg-marquardt", "--format", "json").out)
+    done = run("plan", "r.csv", "--add", "2", "--format", "json")
+    record = json.loads(done.out)
+    assert (done.code, record["verdict"]) == (1, "undetermined")
+    assert record["so_far"] == {key: said[key] for key in ("verdict", "reasons", "cautions")}
+    assert "r.csv: caution: After calibration one pose errs by" in done.err
+    assert run("plan", "r.csv", "--add", "2", "--format", "json", "-q").err == ""
+    shown = run("plan", "r.csv", "--add", "2")
+    assert (shown.code, shown.err) == (1, "")
+    assert shown.out.startswith("Verdict so far: undetermined\n  The least cost lies outside the search box")
+    assert "Caution: After calibration" in shown.out
+    assert "More poses do not mend the verdict on those so far" in shown.out
+
+
+def test_poses_that_only_lack_others_are_mended_by_them(run, faces):
+    record = json.loads(run("plan", faces, "--format", "json").out)
+    assert record["so_far"]["verdict"] == "undetermined"
+    assert record["verdict"] == "good"
+    assert json.loads(run("plan", "--format", "json").out)["so_far"] is None
+
+
+def test_a_record_through_a_pipe_that_is_none_of_a_calibration_is_refused(run):
+    done = run("plan", "-", stdin=b'{"schema": "accelcal/verification/1"}')
+    assert done.code == 2
+    assert done.err.startswith("accelcal: <stdin>: schema is 'accelcal/verification/1'; expected")
 
 
 def test_the_table_says_how_to_hold_the_sensor(run):

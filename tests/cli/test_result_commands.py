@@ -85,6 +85,25 @@ def test_a_missed_tolerance_fails_too(run, result, other):
     assert run("verify", result, other, "--tolerance", "1e-6", "--quiet").err == ""
 
 
+def test_readings_that_cannot_tell_fail(run, result, other):
+    rows = np.loadtxt(other, delimiter=",", skiprows=1)
+    rows[3] *= 1.1
+    np.savetxt("wrong.csv", rows, delimiter=",", header="Nx,Ny,Nz", comments="")
+    shown = run("verify", result, "wrong.csv")
+    assert (shown.code, shown.err) == (1, "")
+    assert shown.out.startswith("Verdict: inconclusive\n")
+    assert "Caution: Beyond chance off the others: line 5. Measure it again.\n" in shown.out
+    plain = run("verify", result, "wrong.csv", "--format", "json")
+    record = json.loads(plain.out)
+    assert (plain.code, record["verdict"]) == (1, "inconclusive")
+    assert plain.err == "".join(f"accelcal: wrong.csv: caution: {text}\n" for text in record["cautions"])
+    assert run("calibrate", "wrong.csv", "--g", G, "-o", "wrong.yaml", "-q").code == 0
+    back = run("verify", "wrong.yaml", other)
+    assert back.code == 1
+    assert "accelcal: wrong.yaml: caution: After calibration one pose errs by" in back.err
+    assert run("verify", "wrong.yaml", other, "-q").err == ""
+
+
 def test_the_level_decides(run, result, other):
     chance = json.loads(run("verify", result, other, "--format", "json").out)["chance"]
     assert run("verify", result, other, "--level", str(min(0.999, chance + 0.001))).code == 1

@@ -111,7 +111,15 @@ def test_a_simulation_that_cannot_be_is_refused(changes, part):
 @pytest.mark.parametrize(("rows", "part"), [(np.eye(3), "3 poses"), (np.ones((12, 3)), "readings are equal")])
 def test_readings_that_cannot_be_calibrated_are_refused(rows, part):
     with pytest.raises(DataError, match=part):
-        Recording.of(Readings.from_array(rows))
+        Recording.of(Readings.from_array(rows), G)
+
+
+def test_readings_that_determine_no_sensor_are_refused():
+    """Three poses, each eight times: a valley of sensors fits, and the search ends where it will."""
+    u = np.repeat(np.array([[1.0, 0, 0], [0, 0.6, 0.8], [-0.6, 0.8, 0]]), 8, axis=0)
+    rows = G * u + 1e-3 * np.random.default_rng(1).normal(size=u.shape)
+    with pytest.raises(DataError, match=r"no one least cost .* undetermined \(The poses do not determine: "):
+        Recording.of(Readings.from_array(rows), G)
 
 
 # Errors
@@ -189,6 +197,18 @@ def test_a_search_that_stalls_is_counted_and_the_polish_mends_it():
     assert row["excess"] < 1e-6
 
 
+def test_the_least_cost_is_the_least_that_anything_found():
+    """A search that comes lower than Levenberg-Marquardt did is the measure; of the same readings for all."""
+    study = comparison(LM, DE)
+    records = run_study(study, Journal(None))
+    low = [dataclasses.replace(r, cost=0.5 * r.values["least_cost"]) if r.cell else r for r in records]
+    lm, de = summary(study, low).records()
+    assert (lm["success_rate"], de["success_rate"]) == (0, 1)
+    assert lm["excess"] == pytest.approx(1.0, rel=1e-6)
+    assert de["excess"] == 0
+    assert (lm["evaluations_to_success"], de["runs"]) == (None, 6)
+
+
 def test_the_successful_runs_can_be_seen_alone():
     study = comparison(Entry("de", "de", {"population": 20, "iterations": 150}), repeats=20, tolerance=0.0)
     records = run_study(study, Journal(None))
@@ -228,7 +248,7 @@ def test_every_optimizer_on_a_real_recording(shared_data):
         "akpso": {"iterations": 250},
     }
     entries = tuple(Entry(name, name, parameters.get(name, {})) for name in OPTIMIZERS.names())
-    study = Comparison(Recording.of(readings), Search(9.81744), entries, repeats=2)
+    study = Comparison(Recording.of(readings, 9.81744), Search(9.81744), entries, repeats=2)
     rows, records = result(study)
     independent = 1.40796808e-2  # another solver's
     assert all(r.values["least_cost"] == pytest.approx(independent, rel=1e-6) for r in records)
