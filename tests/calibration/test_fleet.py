@@ -386,6 +386,30 @@ def test_cautions_of_scatter_and_of_logs_are_those_of_calibrate(tmp_path, header
     assert logged == (header in ("ax,ay,az", "time,ax,ay,az"))
 
 
+def test_doubtful_readings_are_told_as_calibrate_tells_them(tmp_path):
+    """A dead axis, two equal axes, copies of a third of the poses and of fewer, and a gravity of no planet."""
+    tables = {f"S{k}": rows_of(poses.turns(), k) for k in range(5)}
+    tables["S0"][:, 1] = 7.0
+    tables["S1"][:, 2] = tables["S1"][:, 0]
+    tables["S2"][:8] = tables["S2"][16:]
+    tables["S3"][:7] = tables["S3"][17:]
+    write(tmp_path / "odd.csv", tables)
+    readings = read_fleet([str(tmp_path / "odd.csv")])
+    for settings, told in ((LM, ["S0", "S1", "S2"]), (dataclasses.replace(LM, g=98.1), list(tables))):
+        kept = {}
+        fleet = calibrate_fleet(
+            readings, settings, lambda number, record, kept=kept: kept.update({number: record})
+        )
+        assert [readings.sensors[r] for r in np.flatnonzero(fleet.caution != "")] == told
+        assert all(fleet.caution[r] == " ".join(kept[r].cautions) for r in kept)
+        for word, at in (
+            ('"ay" is 7 in every', 0),
+            ('"ax" and "az" are equal', 1),
+            ("8 of 24 poses repeat", 2),
+        ):
+            assert word in fleet.caution[at]
+
+
 def test_a_few_sensors_are_no_fleet_to_stand_out_from(tmp_path):
     tables = {f"S{k}": rows_of(poses.turns(), k) for k in range(9)}
     tables["S3"] *= 2.0
