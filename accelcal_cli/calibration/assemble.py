@@ -67,7 +67,7 @@ def assemble(
         f_0=shown.f_0,
         gauge=settings.gauge,
         sigma=Sigma(sigma_K, sigma_D),
-        dop=Dop.of(seen.dop),
+        dop=Dop.of(judged.dop),
         verdict=judged.verdict,
         reasons=judged.reasons,
         suggestions=judged.suggestions,

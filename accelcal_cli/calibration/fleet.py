@@ -185,6 +185,7 @@ def _calibrated(
             own = None if weights is None else weights[at, : batch.count[at]]
             box, solution = start.take(np.array([at])), _solution(problem, run, at)
             keep(number, assemble(readings.one(batch, at), settings, box, solution, own))
+    reason, dop = reasons(problem, start, run, seen, batch, verdict)
     return Fleet(
         number=batch.sensors,
         poses=batch.count,
@@ -193,13 +194,13 @@ def _calibrated(
         sigma_k=sigma_k,
         sigma_d=sigma_d,
         lower=lower,
-        dop=seen.dop,
+        dop=dop,
         cost=run.cost,
         s=s,
         rms=fits.rms,
         rms_before=fits.rms_before,
         verdict=np.array(verdict, dtype=object),
-        reason=reasons(problem, start, run, seen, batch, verdict),
+        reason=reason,
         caution=fleet_cautions(readings, batch, settings, s, nine, fits),
         outlying=fits.in_words(),
     )

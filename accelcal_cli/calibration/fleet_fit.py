@@ -127,12 +127,15 @@ def _explained(batch: Batch, unit: Float, K: Float) -> Float:
 
 def reasons(
     problem: Loetters, start: Start, run: Run, seen: Observabilities, batch: Batch, verdict: Sequence[str]
-) -> np.ndarray:
-    """Return why each verdict is not good, shape (R,); readings that fix no ellipsoid are seen from the sphere."""
-    words = np.full(len(verdict), "", dtype=object)
+) -> tuple[np.ndarray, Float]:
+    """Return why each verdict is not good, shape (R,), and the dilution of precision that it rests on, shape (R, 9).
+
+    Readings that fix no ellipsoid are seen from the nearest sphere.
+    """
+    words, dop = np.full(len(verdict), "", dtype=object), seen.dop.copy()
     index = np.flatnonzero([word != "good" for word in verdict])
     if not len(index):
-        return words
+        return words, dop
     middle = np.zeros((len(index), problem.unknowns))
     sphere = Observabilities.of(quality.information(problem.of(index), middle), batch.count[index])
     for k, at in enumerate(index):
@@ -142,4 +145,6 @@ def reasons(
             first if round_ else seen.one(int(at)), (), edge_names(run.x[at]), int(batch.count[at]) - 9
         )
         words[at] = " ".join(lines)
-    return words
+        if round_:
+            dop[at] = first.dop
+    return words, dop

@@ -30,6 +30,7 @@ class Judgement:
         verdict: good, weak or undetermined.
         reasons: why it is not good, in sentences; suggestions: poses that would mend it, in words.
         information: J^T J that the words rest on, shape (9, 9).
+        dop: dilution of precision of the nine parameters by it, shape (9,).
         sight: the sensor that the directions of the poses are seen with, gauge `lower`.
         at_wall: the search stopped at a wall of its box: what it found is not the least-squares answer.
     """
@@ -38,6 +39,7 @@ class Judgement:
     reasons: tuple[str, ...]
     suggestions: tuple[str, ...]
     information: Float
+    dop: Float
     sight: ErrorModel
     at_wall: bool
 
@@ -59,7 +61,13 @@ def judge(
     edge = edge_names(solution.x[0])
     verdict = final_verdict(seen.verdict, bool(edge), freedom)
     return Judgement(
-        verdict, reasons_of(first, suggestions, edge, freedom), suggestions, said, sight, bool(edge)
+        verdict,
+        reasons_of(first, suggestions, edge, freedom),
+        suggestions,
+        said,
+        first.dop,
+        sight,
+        bool(edge),
     )
 
 
