@@ -41,7 +41,7 @@ def assemble(
     g = settings.g
     found = model_at(solution.problem, solution.x)
     shown = found.in_gauge(settings.gauge)
-    nine, point = lower_problem(solution.problem, found)
+    nine, point = lower_problem(solution.stated, found)
     low = ErrorModel(*(a[0] for a in nine.parameters(point)))
     information = quality.information(nine, point)[0] - (0.0 if slopes is None else slopes.loss)
     known = Observabilities.of(information[None], np.array([readings.poses]))
@@ -50,7 +50,8 @@ def assemble(
     judged = judge(solution, start, information, low, readings.poses, freedom)
     centre = start.box.centre[0]
     before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
-    fit = examine(readings, low, before_model, g, seen.cofactor, weights, _robust_weight(solution, settings))
+    fitted = _fitted(solution, found, seen.cofactor)
+    fit = examine(readings, low, before_model, g, fitted, weights, _robust_weight(solution, settings))
     variance = _variance(readings, settings, solution, low, weights, freedom)
     covariance = sigma.covariance(known, np.array([variance]), np.array([judged.at_wall]), g)[0]
     sigma_K, sigma_D = sigma.propagate(shown.K, low.K, covariance, settings.gauge, g)
@@ -119,6 +120,14 @@ def _variance(
     if solution.noise:
         return robust_variance(readings, low, settings.g, solution.noise, settings.robust, weights)
     return solution.cost / (4.0 * settings.g**2) / freedom  # L = sum (2 g e)^2
+
+
+def _fitted(solution: Solution, found: ErrorModel, cofactor: Float) -> Float:
+    """Return (J^T W J)^-1 of the fit, shape (9, 9): with robust weights, which leverages and residuals rest on."""
+    if solution.reweighted_from is None:
+        return cofactor
+    nine, point = lower_problem(solution.problem, found)
+    return quality.Observability.of(quality.information(nine, point)[0], 0).cofactor
 
 
 def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:

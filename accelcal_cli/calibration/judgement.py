@@ -82,7 +82,7 @@ def _first_sight(
     if start.source != "sphere":
         return information, seen, low
     sphere = model_at(solution.problem, np.zeros_like(solution.x))
-    nine, point = lower_problem(solution.problem, sphere)
+    nine, point = lower_problem(solution.stated, sphere)
     said = quality.information(nine, point)[0]
     first = Observability.of(said, poses)
     return (said, first, sphere) if first.verdict == "undetermined" else (information, seen, low)

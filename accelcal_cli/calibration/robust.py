@@ -61,7 +61,8 @@ def robust_variance(
 ) -> float:
     """Return the factor of (J^T W J)^-1 in the covariance of the M-estimate, (m/s^2)^2 [huber1981].
 
-    Definition: sum psi^2 / (J - 9) / (mean psi')^2, in units of m/s^2 squared.
+    Definition: sum psi^2 / (J - 9) / (mean psi')^2, in units of m/s^2 squared. W are the weights of the poses, without
+    those of the loss.
     """
     square, slope = 0.0, 0.0
     for first, e, _ in modulus_errors(readings, model, g):

@@ -39,6 +39,7 @@ class Solution:
         cost: L at x; evaluations: all of them.
         agreeing: how many runs ended in the same minimum.
         noise: robust standard deviation of e, m/s^2; None without a robust loss.
+        reweighted_from: with a robust loss the problem before it, with the weights of the poses alone.
     """
 
     problem: Loetters
@@ -49,6 +50,12 @@ class Solution:
     evaluations: int
     agreeing: int
     noise: float | None = None
+    reweighted_from: Loetters | None = None
+
+    @property
+    def stated(self) -> Loetters:
+        """The problem as it was stated, without robust weights: what the poses alone say."""
+        return self.problem if self.reweighted_from is None else self.reweighted_from
 
 
 def search(problem: Loetters, settings: Settings) -> Solution:
@@ -104,6 +111,7 @@ def resolve(solution: Solution, problem: Loetters) -> Solution:
 def reweight(solution: Solution, readings: Readings, settings: Settings, weights: Float | None) -> Solution:
     """Solve again under the robust loss: weights from the residuals, residuals from the weights."""
     g, triangle = settings.g, solution.problem.triangle
+    solution = replace(solution, reweighted_from=solution.problem)
     for _ in range(REWEIGHTINGS):
         model = model_at(solution.problem, solution.x)
         noise = robust.noise_scale(readings, model, g)

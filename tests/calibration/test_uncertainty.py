@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, t
-from simulated import DPSO
+from simulated import DPSO, MEMS, noise
 
 from accelcal_cli.calibration import quality
 from accelcal_cli.calibration.compress import compress_each
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.sigma import propagate
 from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimizers.minimize import Status, minimize
 from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.streams import Streams
 
 G, RUNS, SIGMA = 9.8, 2000, 1e-3
@@ -111,3 +116,19 @@ def test_the_noise_is_estimated_without_bias(fits):
     scaled = fits.freedom * fits.s2 / SIGMA**2
     share = (scaled > chi2.ppf(0.95, fits.freedom)).mean()
     assert share == pytest.approx(0.05, abs=0.02)
+
+
+@pytest.mark.parametrize("robust", ["huber", "soft-l1"])
+def test_sigma_of_a_robust_loss_is_the_scatter_of_its_estimates(robust):
+    """200 calibrations from 60 poses; the dilution of precision stays that of the poses."""
+    u, settings = poses.fibonacci(60), Settings(optimizer="levenberg-marquardt", g=G, robust=robust)
+    lower, found, stated = np.tril_indices(3), [], []
+    for seed in range(200):
+        data = Readings.from_array(MEMS.output(G * u + noise(60, 1e-2, seed)))
+        result = calibrate(data, settings)
+        found.append(np.append(result.K_a[lower], result.D_a))
+        stated.append(np.append(result.sigma.K_a[lower], result.sigma.D_a))
+    ratio = np.sqrt(np.mean(np.square(stated), axis=0)) / np.std(found, axis=0)
+    assert ratio.mean() == pytest.approx(1.0, abs=0.05)
+    plain = calibrate(data, replace(settings, robust="none"))
+    assert result.dop.worst == pytest.approx(plain.dop.worst, rel=1e-3)
