@@ -100,12 +100,7 @@ def command(
     records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     show(study, records, format if output != "-" else "")
     written = [path for path in (raw, output, plot) if path not in (None, "-")]
-    if output is not None:
-        _write_curves(study, records, output)
-    if plot is not None:
-        from accelcal_cli.output.voyage import plot_voyage
-
-        plot_voyage(study, records, plot)
+    _write(study, records, output, plot)
     if not quiet:
         for path in written:
             typer.echo(f"accelcal: wrote {path}", err=True)
@@ -231,19 +226,26 @@ def reproduce(
 
         rich_console.show_split(table, rich_console.console())
     sys.stdout.flush()
-    if plot is not None:
-        from accelcal_cli.output.voyage import plot_voyage
-
-        plot_voyage(study, records, plot)
+    _write(study, records, None, plot)
     if not quiet:
         for path in filter(None, (raw, plot)):
             typer.echo(f"accelcal: wrote {path}", err=True)
 
 
-def _write_curves(study: Navigation, records: Sequence[Record], output: str) -> None:
+def _write(study: Navigation, records: Sequence[Record], output: str | None, plot: str | None) -> None:
+    """Write the curves as CSV and the picture, as far as they are wanted."""
+    if output is None and plot is None:
+        return
     from accelcal_cli.output.files import whole_file
     from accelcal_cli.output.plain import write_csv
     from accelcal_cli.studies.navigation_tables import curves
 
-    with whole_file(output) as file:
-        write_csv(curves(study, records), file)
+    found = curves(study, records)
+    if output is not None:
+        with whole_file(output) as file:
+            write_csv(found, file)
+    if plot is not None:
+        from accelcal_cli.output.voyage import plot_voyage
+        from accelcal_cli.studies.voyage_chart import chart_of
+
+        plot_voyage(chart_of(study, records, found), plot)
