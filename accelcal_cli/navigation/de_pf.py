@@ -6,11 +6,12 @@ destroying the posterior; see docs/explanation/gravity-navigation.md for what ea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
 
+from accelcal_cli.errors import ConfigError
 from accelcal_cli.navigation.differential import Operators, evolve, metropolis
 from accelcal_cli.navigation.filters import FILTERS, Track
 from accelcal_cli.navigation.marginal import Marginal
@@ -19,6 +20,15 @@ from accelcal_cli.navigation.resampling import moments, systematic
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
+
+EVOLUTION = ("F_min", "F_max", "CR_min", "CR_max", "mutation")
+IDLE = {
+    "marginal": ("roughening", "threshold", "resampling", "state", "fraction", *EVOLUTION),
+    "metropolis": ("fraction", "window", "inflation", "swell", *EVOLUTION),
+    "window": ("inflation", "swell"),
+    "safe": ("window", "inflation", "swell"),
+}
+"""Settings that have no effect in mode default, by road."""
 
 
 @FILTERS.register("de-pf")
@@ -44,6 +54,15 @@ class DePf(Evolving):
     mutation: Literal["best-r", "current-to-best", "rand-to-best"] = setting(
         "best-r", "reading of the mutation: m + F (best - r), current-to-best/1 or rand-to-best/1"
     )
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and those that would have no effect."""
+        super().__post_init__()
+        if self.mode == "literal":
+            return
+        for part in fields(self):
+            if part.name in IDLE[self.road] and getattr(self, part.name) != part.default:
+                raise ConfigError(f"{part.name}: has no effect on road {self.road}; leave it out")
 
     def run(self, scenario: Scenario, streams: Streams) -> Track:
         """Return the filter's track; see `Filter`."""

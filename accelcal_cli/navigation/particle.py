@@ -58,7 +58,10 @@ class Sir(Filter):
         30.0, "noise of the position error in a step of 10 s, m", low=0.0, high=10_000.0
     )
     variance: float | None = setting(
-        None, "R in the filter, mGal^2; not set: 1 in mode literal, 4 in mode default", above=0.0
+        None,
+        "R in the filter, mGal^2; not set: that of the gravimeter, in mode default four times as much but for de-pf's "
+        "road marginal",
+        above=0.0,
     )
     threshold: float = setting(2 / 3, "resample when N_eff is below this part of N", low=0.0, high=1.0)
     resampling: Literal["systematic", "residual"] = setting("systematic", "scheme")

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from accelcal_cli.errors import ConfigError
 from accelcal_cli.navigation.apo_pf import forces, masses
 from accelcal_cli.navigation.bound import bound
+from accelcal_cli.navigation.de_pf import IDLE
 from accelcal_cli.navigation.differential import Operators, evolve, metropolis
 from accelcal_cli.navigation.error_model import Grade
 from accelcal_cli.navigation.field import PRESETS, generate
@@ -270,3 +272,18 @@ def test_residual_resampling_and_twelve_states_beat_the_ins(rough, settings):
     scenario = simulate(rough, Plan(hours=4.0), Grade(), runs=range(3), seed=1, period=20.0)
     _, scores = run(scenario, "pf", runs=range(3), **settings)
     assert rmse(scores) < 0.5 * np.sqrt(scores.ins.mean())
+
+
+@pytest.mark.parametrize(("road", "idle"), [(road, name) for road, names in IDLE.items() for name in names])
+def test_a_setting_without_effect_on_its_road_is_refused(road, idle):
+    other = {"resampling": "residual", "state": 12, "mutation": "rand-to-best", "window": 7}.get(idle, 0.75)
+    with pytest.raises(ConfigError, match=f"{idle}: has no effect on road {road}"):
+        FILTERS.build(
+            "de-pf", {"road": road, idle: 1.5 if idle in ("inflation", "swell") else other}, "de-pf"
+        )
+
+
+def test_settings_with_effect_are_taken():
+    FILTERS.build("de-pf", {"road": "safe", "fraction": 0.4, "F_max": 0.7}, "de-pf")
+    FILTERS.build("de-pf", {"road": "window", "window": 4}, "de-pf")
+    FILTERS.build("de-pf", {"mode": "literal", "mutation": "rand-to-best"}, "de-pf")
