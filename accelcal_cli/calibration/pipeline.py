@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from accelcal_cli.calibration.assemble import assemble
-from accelcal_cli.calibration.compress import compress
 from accelcal_cli.calibration.lotters import Loetters
-from accelcal_cli.calibration.nominal import search_box
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.robust import pose_weights
 from accelcal_cli.calibration.search import Solution, model_at, resolve, reweight, search
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.temperature import Slopes, fit
-from accelcal_cli.calibration.weighting import shared_weights, weighted
+from accelcal_cli.calibration.weighting import opened, packed, shared_weights
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.streams import Float
@@ -38,11 +36,7 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
         raise DataError(f"{readings.source}: all readings are equal; expected poses that differ in attitude")
     shared = settings.weights == "auto"
     weights = shared_weights(readings, settings) if shared else pose_weights(readings, settings.weights)
-    centre = 0.5 * (readings.lower + readings.upper)
-    scale = 0.5 * float((readings.upper - readings.lower).max())
-    triangle = compress(weighted(readings, weights), centre, scale)
-    start = search_box(triangle, settings)
-    problem = Loetters(triangle, settings.g, start.box)
+    problem, start = opened(readings, settings, weights)
     solution = search(problem, settings)
     if settings.robust != "none":
         solution = reweight(solution, readings, settings, weights)
@@ -55,8 +49,8 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
     slopes, note = _slopes(readings, solution, settings, weights)
     if slopes is None:
         return assemble(noted(readings, note), settings, start, solution, weights)
-    triangle = compress(weighted(slopes.readings, weights), centre, scale)
-    solution = resolve(solution, Loetters(triangle, settings.g, start.box))
+    warmed = packed(slopes.readings, weights, within=readings)
+    solution = resolve(solution, Loetters(warmed, settings.g, start.box))
     return assemble(noted(slopes.readings, note), settings, start, solution, weights, slopes)
 
 

@@ -57,9 +57,9 @@ def screen(readings: Readings, g: float) -> Screened:
 
 def _rough(readings: Readings, settings: Settings) -> Screened | None:
     """Return the nearest sphere where the poses determine no more, so that no search has to find that out."""
-    problem, source = opened(readings, settings, None)
+    problem, start = opened(readings, settings, None)
     middle = np.zeros_like(problem.box.centre)
     seen = Observability.of(information(problem, middle)[0], readings.poses)
-    if source != "sphere" or seen.verdict != "undetermined":
+    if start.source != "sphere" or seen.verdict != "undetermined":
         return None
     return Screened(model_at(problem, middle), np.nan, np.nan, np.inf, seen.verdict)

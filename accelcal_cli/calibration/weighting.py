@@ -12,9 +12,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from accelcal_cli.calibration.compress import compress
+from accelcal_cli.calibration.compress import Triangle, compress
 from accelcal_cli.calibration.lotters import Loetters
-from accelcal_cli.calibration.nominal import search_box
+from accelcal_cli.calibration.nominal import Start, search_box
 from accelcal_cli.calibration.residuals import modulus_errors
 from accelcal_cli.calibration.search import model_at, polish
 from accelcal_cli.calibration.settings import Settings
@@ -33,7 +33,15 @@ LEAST = 0.01
 """Least m^2, as part of the mean v_j: no pose is free of every other error."""
 
 
-def weighted(readings: Readings, weights: Float | None) -> Iterator[tuple[Float, Float | None]]:
+def packed(readings: Readings, weights: Float | None, within: Readings | None = None) -> Triangle:
+    """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
+    extent = within or readings
+    centre = 0.5 * (extent.lower + extent.upper)
+    scale = 0.5 * float((extent.upper - extent.lower).max())
+    return compress(_weighted(readings, weights), centre, scale)
+
+
+def _weighted(readings: Readings, weights: Float | None) -> Iterator[tuple[Float, Float | None]]:
     """Yield readings with their weights, block by block."""
     for first, block in readings.blocks():
         yield block, None if weights is None else weights[first : first + len(block)]
@@ -87,13 +95,11 @@ def shared_variance(errors: Float, own: Float, freedom: int) -> float:
     return high
 
 
-def opened(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, str]:
-    """Return the problem of the weighted readings, and where the middle of its box comes from, see `Start`."""
-    centre = 0.5 * (readings.lower + readings.upper)
-    scale = 0.5 * float((readings.upper - readings.lower).max())
-    triangle = compress(weighted(readings, weights), centre, scale)
+def opened(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Start]:
+    """Return the problem of the weighted readings, and where its box comes from."""
+    triangle = packed(readings, weights)
     start = search_box(triangle, settings)
-    return Loetters(triangle, settings.g, start.box), start.source
+    return Loetters(triangle, settings.g, start.box), start
 
 
 def fitted(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Float]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from accelcal_cli.calibration.compress import Triangle, compress, compress_each
+from accelcal_cli.calibration.compress import Triangle, compress_each
 from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
 from accelcal_cli.calibration.nominal import BOX_PURPOSE, SHIFT, half_widths
@@ -19,6 +19,7 @@ from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.quality import information
 from accelcal_cli.calibration.search import polish
 from accelcal_cli.calibration.settings import BoxSettings, Settings
+from accelcal_cli.calibration.weighting import packed
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 from accelcal_cli.sensor.poses import directions
@@ -87,15 +88,13 @@ class Recording:
                 f"{readings.source}: there is no one least cost to compare with; accelcal calibrate calls these "
                 f"readings undetermined ({found.reasons[0].rstrip('.')})"
             )
-        centre = 0.5 * (readings.lower + readings.upper)
-        scale = 0.5 * float((readings.upper - readings.lower).max())
-        packed = compress(((block, None) for _, block in readings.blocks()), centre, scale)
+        triangle = packed(readings, None)
         return cls(
             readings.source,
             readings.sha256,
-            tuple(tuple(row) for row in packed.R[0].tolist()),
-            tuple(centre.tolist()),
-            scale,
+            tuple(tuple(row) for row in triangle.R[0].tolist()),
+            tuple(triangle.centre[0].tolist()),
+            float(triangle.scale[0]),
             readings.poses,
         )
 
