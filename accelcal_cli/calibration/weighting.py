@@ -16,6 +16,7 @@ from accelcal_cli.calibration.compress import Triangle, compress
 from accelcal_cli.calibration.lotters import Loetters
 from accelcal_cli.calibration.nominal import Start, search_box
 from accelcal_cli.calibration.residuals import modulus_errors
+from accelcal_cli.calibration.scatter import explained
 from accelcal_cli.calibration.search import model_at, polish
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import DataError
@@ -115,5 +116,4 @@ def _errors(readings: Readings, model: ErrorModel, g: float) -> tuple[Float, Flo
     u = force / np.linalg.norm(force, axis=1, keepdims=True)
     if readings.scatter is None or readings.count is None:
         return errors, np.zeros_like(errors)
-    noise = readings.scatter @ np.diag(1.0 / np.diagonal(model.K))
-    return errors, np.sum((u * noise) ** 2, axis=1) / readings.count
+    return errors, explained(u, readings.scatter, readings.count, np.diagonal(model.K))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from rich.console import Console
 from rich.text import Text
 
 from accelcal_cli.output import console as rich_console
@@ -38,15 +39,21 @@ def show_benchmark(
     for function, plotted in curves.items():
         rich_console.show_split(_of_function(rows, function), out)
         if plotted and out.width >= NARROWEST_CURVE:
-            points = {
-                label: [(float(n), float(c)) for n, c in zip(*curve, strict=True)]
-                for label, curve in plotted.items()
-            }
-            text = draw_several(points, width=min(60, out.width - 22), least=tolerance * BELOW)
-            out.print(Text(f"{function}: median cost so far, logarithmic"))
-            out.print(Text(text), crop=False, overflow="ignore", soft_wrap=True)
-            out.print()
+            show_curves(function, plotted, out, least=tolerance * BELOW)
     rich_console.show(further, out)
+
+
+def show_curves(
+    name: str, panel: Mapping[str, tuple[Float, Float]], out: Console, least: float = 0.0
+) -> None:
+    """Print the curves of one function or problem; costs below `least` lie on the floor."""
+    points = {
+        label: [(float(n), float(c)) for n, c in zip(*curve, strict=True)] for label, curve in panel.items()
+    }
+    out.print(Text(f"{name}: median cost so far, logarithmic"))
+    text = draw_several(points, width=min(60, out.width - 22), least=least)
+    out.print(Text(text), crop=False, overflow="ignore", soft_wrap=True)
+    out.print()
 
 
 def _of_function(rows: Table, function: str) -> Table:

@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from accelcal_cli.calibration.detection import Detection
-from accelcal_cli.output.files import whole_file
+from accelcal_cli.output.figure import COLOURS, picture
 from accelcal_cli.streams import Float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73")
-"""Okabe and Ito's blue, vermilion and green, which the colour-blind tell apart."""
 
 SHADE = "#F0E442"
 MOST_NUMBERS = 110
@@ -29,11 +26,7 @@ def plot_log(found: Detection, path: str) -> None:
         found: a detection with its envelope.
         path: ends in .png or .svg.
     """
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(12, 4.8), layout="constrained")
+    with picture(path, 12.0, 4.8) as figure:
         axes = figure.subplots()
         edges = _spans(found)
         _log(axes, found)
@@ -46,11 +39,6 @@ def plot_log(found: Detection, path: str) -> None:
         axes.set_xlabel("row" if found.intervals.time is None else "time")
         axes.set_ylabel("output, sensor units")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-        svg = Path(path).suffix == ".svg"
-        with whole_file(path, binary=True) as file:
-            figure.savefig(
-                file, format="svg" if svg else "png", dpi=150, metadata={"Date": None} if svg else {}
-            )
 
 
 def _spans(found: Detection) -> Float:

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accelcal_cli.output.files import whole_file
+from accelcal_cli.output.figure import line_style, picture
 from accelcal_cli.streams import Float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's colours, which the colour-blind tell apart; a second round is dashed, a third dotted."""
-
-DASHES = ("-", "--", ":")
 
 ACROSS = 3
 """Panels side by side at most."""
@@ -35,15 +29,10 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
         tolerance: drawn as a thin line.
         path: ends in .png or .svg.
     """
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     across = min(ACROSS, math.ceil(math.sqrt(len(curves))))
     down = -(-len(curves) // across)
     labels = list(dict.fromkeys(label for panel in curves.values() for label in panel))
-    with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
-        width = max(4.2 * across, 6.0)
-        figure = Figure(figsize=(width, 3.2 * down + 1.1), layout="constrained")
+    with picture(path, max(4.2 * across, 6.0), 3.2 * down + 1.1) as figure:
         figure.suptitle(title, fontsize=11)
         panels = figure.subplots(down, across, squeeze=False).ravel()
         for axes, (name, panel) in zip(panels, curves.items(), strict=False):
@@ -53,17 +42,6 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
         figure.legend(
             handles=_legend(labels), loc="outside lower center", ncols=min(len(labels), 5), frameon=False
         )
-        svg = Path(path).suffix == ".svg"
-        with whole_file(path, binary=True) as file:
-            figure.savefig(
-                file, format="svg" if svg else "png", dpi=150, metadata={"Date": None} if svg else {}
-            )
-
-
-def line_style(number: int) -> dict[str, Any]:
-    """Return how matplotlib draws line `number`, from 0: a colour of its own, then a dash of its own."""
-    dashes = DASHES[number // len(COLOURS) % len(DASHES)]
-    return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes, "linewidth": 1.6}
 
 
 def _legend(labels: list[str]) -> list[Any]:

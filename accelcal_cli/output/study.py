@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from rich.text import Text
 
 from accelcal_cli.output import console as rich_console
-from accelcal_cli.output.benchmark import NARROWEST_CURVE, Curves
-from accelcal_cli.output.curve import draw_several
-from accelcal_cli.streams import Float
+from accelcal_cli.output.benchmark import NARROWEST_CURVE, Curves, show_curves
 from accelcal_cli.table import Table
 
 
@@ -31,17 +29,4 @@ def show_study(title: str, tables: Iterable[Table], curves: Curves, note: str = 
     if out.width < NARROWEST_CURVE:
         return
     for name, panel in curves.items():
-        out.print(Text(f"{name}: median cost so far, logarithmic"))
-        out.print(
-            Text(draw_several(_points(panel), width=min(60, out.width - 22))),
-            crop=False,
-            overflow="ignore",
-            soft_wrap=True,
-        )
-        out.print()
-
-
-def _points(panel: Mapping[str, tuple[Float, Float]]) -> dict[str, list[tuple[float, float]]]:
-    return {
-        label: [(float(n), float(c)) for n, c in zip(*curve, strict=True)] for label, curve in panel.items()
-    }
+        show_curves(name, panel, out)

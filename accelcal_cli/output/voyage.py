@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from accelcal_cli.output.files import whole_file
-from accelcal_cli.output.plot import line_style
+from accelcal_cli.output.figure import line_style, picture
 from accelcal_cli.studies.navigation_tables import BOUND, INS
 from accelcal_cli.studies.voyage_chart import Chart
 from accelcal_cli.table import Table
@@ -34,22 +32,13 @@ def plot_voyage(chart: Chart, path: str) -> None:
         chart: what it shows.
         path: ends in .png or .svg.
     """
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(11.0, 8.5), layout="constrained")
+    with picture(path, 11.0, 8.5) as figure:
         panels = figure.subplots(2, 2).ravel()
         _draw_map(panels[0], chart)
         _draw_errors(panels[1:], chart.curves)
         handles, names = panels[0].get_legend_handles_labels()
         columns = max(1, min(len(names), LEGEND // (max(map(len, names)) + 6)))
         figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
-        svg = Path(path).suffix == ".svg"
-        with whole_file(path, binary=True) as file:
-            figure.savefig(
-                file, format="svg" if svg else "png", dpi=130, metadata={"Date": None} if svg else {}
-            )
 
 
 def _draw_map(axes: Any, chart: Chart) -> None:
