@@ -19,6 +19,11 @@ LARGE = 0.005
 """A noise of one pose above this part of g is told of. Data sheets of MEMS accelerometers state nonlinearities of up to
 0.5 % of full scale, and the real recordings of the tests leave 0.01 to 0.04 %."""
 
+PERPENDICULAR = (
+    "The axes were taken as perpendicular, no misalignment was estimated: one of 10 mrad, usual in low-cost sensors, "
+    "moves 1 % of the force along one axis to another."
+)
+
 STOPPED_SHORT = 0.01
 """Part of the cost that one more step would take off, from which on a search is told to be unfinished."""
 
@@ -56,6 +61,7 @@ def cautions(
         *_more_than_noise(*noise),
         *_noise_bias(s, settings.g, sigma_scale),
         *_search(agreeing, settings.runs, left),
+        *(() if settings.misalignment else (PERPENDICULAR,)),
         *odd_gravity(settings.g),
     )
 

@@ -84,6 +84,7 @@ def check_settings(settings: Settings) -> None:
         "robust": ("none",),
         "weights": ("none", "n", "sd"),
         "attitudes": ("unknown",),
+        "misalignment": (True,),
         "gauge": ("lower", "upper", "symmetric"),
         "runs": (1,),
         "polish": (True,),

@@ -14,12 +14,15 @@ from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verdict import FEWEST_POSES, edge_names, final_verdict, reasons_of
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import describe
-from accelcal_cli.streams import Float
+from accelcal_cli.streams import Bool, Float
 
 COMFORTABLE = 5.0
 """Suggested poses bring every dilution of precision to this: half of what counts as weak."""
 
 MOST_SUGGESTIONS = 8
+
+CERTAIN = 1e6
+"""Information, in poses, that stands for knowing a parameter when poses are suggested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +48,13 @@ class Judgement:
 
 
 def judge(
-    solution: Solution, start: Start, information: Float, low: ErrorModel, poses: int, freedom: int
+    solution: Solution,
+    start: Start,
+    information: Float,
+    low: ErrorModel,
+    poses: int,
+    freedom: int,
+    held: Bool | None = None,
 ) -> Judgement:
     """Return the judgement of a solution.
 
@@ -54,15 +63,16 @@ def judge(
         information: J^T J of the nine parameters, shape (9, 9).
         low: the sensor found, gauge `lower`.
         poses: J; freedom: J less the parameters.
+        held: which of the nine are not estimated, shape (9,).
     """
-    seen = Observability.of(information, poses)
-    said, first, sight = _first_sight(solution, start, information, seen, low, poses)
-    suggestions = _suggest(said, first, poses)
+    seen = Observability.of(information, poses, held)
+    said, first, sight = _first_sight(solution, start, information, seen, low, poses, held)
+    suggestions = _suggest(said if held is None else said + CERTAIN * np.diag(held), first, poses)
     edge = edge_names(solution.x[0])
     verdict = final_verdict(seen.verdict, bool(edge), freedom)
     return Judgement(
         verdict,
-        reasons_of(first, suggestions, edge, freedom),
+        reasons_of(first, suggestions, edge, freedom, 9 if held is None else 9 - int(held.sum())),
         suggestions,
         said,
         first.dop,
@@ -72,7 +82,13 @@ def judge(
 
 
 def _first_sight(
-    solution: Solution, start: Start, information: Float, seen: Observability, low: ErrorModel, poses: int
+    solution: Solution,
+    start: Start,
+    information: Float,
+    seen: Observability,
+    low: ErrorModel,
+    poses: int,
+    held: Bool | None,
 ) -> tuple[Float, Observability, ErrorModel]:
     """Return the information, the observability and the sensor that the verdict is explained with.
 
@@ -84,7 +100,7 @@ def _first_sight(
     sphere = model_at(solution.problem, np.zeros_like(solution.x))
     nine, point = lower_problem(solution.stated, sphere)
     said = quality.information(nine, point)[0]
-    first = Observability.of(said, poses)
+    first = Observability.of(said, poses, held)
     return (said, first, sphere) if first.verdict == "undetermined" else (information, seen, low)
 
 

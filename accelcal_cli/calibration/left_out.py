@@ -28,14 +28,14 @@ class LeftOut:
     Attributes:
         error: |f| - g of the pose left out, m/s^2, shape (S,).
         studentised: the same over its standard deviation, from the residuals of the others, shape (S,).
-            Both NaN where the others do not determine the sensor, or where fewer than ten are left.
+            Both NaN where the others do not determine the sensor, or where too few are left.
     """
 
     error: Float
     studentised: Float
 
 
-def leave_out(force: Float, weights: Float, pose: Int, g: float) -> LeftOut:
+def leave_out(force: Float, weights: Float, pose: Int, g: float, held: Bool | None = None) -> LeftOut:
     """Fit S sensors anew, each without one of its poses.
 
     Args:
@@ -43,19 +43,22 @@ def leave_out(force: Float, weights: Float, pose: Int, g: float) -> LeftOut:
         weights: of the poses, 0 for none, shape (S, J).
         pose: which one to leave out, shape (S,).
         g: local gravity, m/s^2.
+        held: which of the nine parameters are not estimated, shape (9,).
     """
+    free = np.arange(9) if held is None else np.flatnonzero(~held)
     sensors = np.arange(len(pose))
     kept = weights.copy()
     kept[sensors, pose] = 0.0
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
-            e, rows, cofactor = _linearised(force, kept, g)
-            step = -(cofactor @ (rows.swapaxes(1, 2) @ (kept * e)[..., None]))[..., 0]
+            e, rows, cofactor = _linearised(force, kept, g, free)
+            step = np.zeros((len(pose), 9))
+            step[:, free] = -(cofactor @ (rows.swapaxes(1, 2) @ (kept * e)[..., None]))[..., 0]
             force = _moved(force, step, g)
             if not np.any(np.abs(step) > SETTLED * g):
                 break
-        e, rows, cofactor = _linearised(force, kept, g)
-        freedom = np.count_nonzero(kept, axis=1) - 9
+        e, rows, cofactor = _linearised(force, kept, g, free)
+        freedom = np.count_nonzero(kept, axis=1) - len(free)
         variance = np.sum(kept * e * e, axis=1) / np.where(freedom > 0, freedom, np.nan)
         at = rows[sensors, pose]
         spread = 1.0 / weights[sensors, pose] + np.sum((cofactor @ at[..., None])[..., 0] * at, axis=1)
@@ -63,13 +66,14 @@ def leave_out(force: Float, weights: Float, pose: Int, g: float) -> LeftOut:
         return LeftOut(error, -e[sensors, pose] / np.sqrt(variance * spread))
 
 
-def _linearised(force: Float, weights: Float, g: float) -> tuple[Float, Float, Float]:
+def _linearised(force: Float, weights: Float, g: float, free: Int) -> tuple[Float, Float, Float]:
     """Return e = (g^2 - |f|^2) / 2g, its derivatives by the changes of `_moved`, and the inverse of their products.
 
-    Shapes (S, J), (S, J, 9) and (S, 9, 9); NaN where the weighted poses do not determine a sensor.
+    Shapes (S, J), (S, J, p) and (S, p, p) for the p parameters at `free`; NaN where the weighted poses do not determine
+    a sensor.
     """
     e = (g * g - np.sum(force * force, axis=2)) / (2.0 * g)
-    rows = design(force / g)
+    rows = design(force / g)[..., free]
     normal = (rows * weights[..., None]).swapaxes(1, 2) @ rows
     known: Bool = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
     known[known] = np.linalg.eigvalsh(normal[known])[:, 0] > LEAST_ROOM * np.einsum("spp->s", normal[known])

@@ -24,20 +24,20 @@ ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), 
 
 AROUND = {
     n + 1: np.array([positions.get((i % 3, j % 3), n) for i in range(5) for j in range(5)])
-    for n in (9, 12)
+    for n in (6, 9, 12)
     for positions in [{place: k for k, place in enumerate(ROWS_COLUMNS[: n - 3])}]
 }
 """Which row of n unknowns and a zero each entry of the 5 x 5 table is that holds K going round, by n + 1."""
 
 
 def pack(K: Float, D: Float, unknowns: int) -> Float:
-    """Return the unknowns, shape (..., 9 or 12), of K, shape (..., 3, 3), and D, shape (..., 3)."""
+    """Return the unknowns, shape (..., 6, 9 or 12), of K, shape (..., 3, 3), and D, shape (..., 3)."""
     rows, columns = zip(*ROWS_COLUMNS[: unknowns - 3], strict=True)
     return np.concatenate([K[..., rows, columns], D], axis=-1)
 
 
 def unpack(theta: Float) -> tuple[Float, Float]:
-    """Return K, shape (..., 3, 3), and D, shape (..., 3), of the unknowns, shape (..., 9 or 12)."""
+    """Return K, shape (..., 3, 3), and D, shape (..., 3), of the unknowns, shape (..., 6, 9 or 12)."""
     K = np.zeros((*theta.shape[:-1], 3, 3))
     rows, columns = zip(*ROWS_COLUMNS[: theta.shape[-1] - 3], strict=True)
     K[..., rows, columns] = theta[..., :-3]
@@ -49,7 +49,7 @@ class Box:
     """The search box in the units of the readings.
 
     Attributes:
-        centre: nominal unknowns (K_11 K_22 K_33 K_21 K_31 K_32 [K_12 K_13 K_23] D_1 D_2 D_3), shape (R, D).
+        centre: nominal unknowns (K_11 K_22 K_33 [K_21 K_31 K_32 [K_12 K_13 K_23]] D_1 D_2 D_3), shape (R, D).
         half: half-widths, same shape.
     """
 
@@ -67,7 +67,7 @@ class Loetters(Problem):
     Args:
         triangle: compressed readings, with leading axis R when the runs are different sensors.
         g: local gravity, m/s^2.
-        box: centre and half-widths; D = 9 (lower-triangular K_a) or 12 (full).
+        box: centre and half-widths; D = 6 (diagonal K_a), 9 (lower-triangular) or 12 (full).
     """
 
     has_residuals = True

@@ -31,7 +31,7 @@ class Start:
     """Where searches start.
 
     Attributes:
-        box: the search box of each of R sensors, D = 9 or 12.
+        box: the search box of each of R sensors, D = 6, 9 or 12.
         sources: of each: "stated", "closed form" or "sphere".
     """
 
@@ -55,7 +55,7 @@ def search_box(triangle: Triangle, settings: Settings) -> Start:
         triangle: the compressed readings of R sensors.
         settings: stated nominal, half-widths, gauge, seed.
     """
-    unknowns = 12 if settings.gauge == "full" else 9
+    unknowns = 6 if not settings.misalignment else 12 if settings.gauge == "full" else 9
     sensors = len(triangle.scale)
     if settings.nominal is not None:
         K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))

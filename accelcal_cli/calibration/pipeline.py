@@ -44,7 +44,7 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
         readings = noted(
             readings, "The columns of a reference specific force are used with --attitudes known only."
         )
-    if readings.temperature is None or not settings.temperature:
+    if readings.temperature is None or not settings.temperature or not settings.misalignment:
         return assemble(readings, settings, start, solution, weights)
     slopes, note = _slopes(readings, solution, settings, weights)
     if slopes is None:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.calibration.lotters import ROWS_COLUMNS, Loetters, pack
-from accelcal_cli.streams import Float, Int
+from accelcal_cli.streams import Bool, Float, Int
 
 PARAMETERS = (
     "scale factor x",
@@ -37,6 +37,9 @@ those with an excellent residual and useless parameters had 25 to 1850."""
 RANK_TOLERANCE = 1e-12
 """An eigenvalue of the information below this part of the largest is zero: double precision's square root of
 it, 1e-6, is the smallest relative difference between poses that an ordinary CSV file can carry."""
+
+ALIGNED = np.repeat([False, True, False], 3)
+"""The parameters that are not estimated when the axes are taken as perpendicular."""
 
 Verdict = Literal["good", "weak", "undetermined"]
 
@@ -77,9 +80,12 @@ class Observability:
     rank: int
 
     @classmethod
-    def of(cls, information: Float, poses: int) -> Observability:
-        """Return the observability of an information matrix J^T J, shape (9, 9), from `poses` poses."""
-        return Observabilities.of(information[None], np.array([poses])).one(0)
+    def of(cls, information: Float, poses: int, held: Bool | None = None) -> Observability:
+        """Return the observability of an information matrix J^T J, shape (9, 9), from `poses` poses.
+
+        `held` parameters, shape (9,), are known and not estimated.
+        """
+        return Observabilities.of(information[None], np.array([poses]), held).one(0)
 
     @property
     def worst(self) -> float:
@@ -111,8 +117,13 @@ class Observabilities:
     rank: Int
 
     @classmethod
-    def of(cls, information: Float, poses: Int) -> Observabilities:
-        """Return the observability of matrices J^T J, shape (R, 9, 9), from so many poses, shape (R,)."""
+    def of(cls, information: Float, poses: Int, held: Bool | None = None) -> Observabilities:
+        """Return the observability of matrices J^T J, shape (R, 9, 9), from so many poses, shape (R,).
+
+        `held` parameters, shape (9,), are known and not estimated: they have no error.
+        """
+        if held is not None and held.any():
+            return cls._of_free(information, poses, np.flatnonzero(~held))
         values, vectors = np.linalg.eigh(information)
         transposed = vectors.swapaxes(1, 2)
         known = values > RANK_TOLERANCE * values[:, -1:]
@@ -124,6 +135,16 @@ class Observabilities:
         whole = known.all(axis=1, keepdims=True)
         dop = np.where(whole, dop, np.where(bounded > UNDETERMINED, np.inf, bounded))
         return cls(cofactor, dop, bounded, np.minimum(known.sum(axis=1), poses))
+
+    @classmethod
+    def _of_free(cls, information: Float, poses: Int, free: Int) -> Observabilities:
+        """Return the observability of the parameters at `free`, the others without error."""
+        seen = cls.of(information[:, free[:, None], free], poses)
+        cofactor = np.zeros_like(information)
+        cofactor[:, free[:, None], free] = seen.cofactor
+        dop, bounded = np.zeros((2, *information.shape[:2]))
+        dop[:, free], bounded[:, free] = seen.dop, seen.bounded
+        return cls(cofactor, dop, bounded, seen.rank + 9 - len(free))
 
     def one(self, index: int) -> Observability:
         """Return what the set of poses number `index` says."""

@@ -95,6 +95,7 @@ def examine(
     cofactor: Float,
     weights: Float | None,
     robust: Callable[[Float], Float] | None = None,
+    held: Bool | None = None,
 ) -> Fit:
     """Return the fit of a model in gauge `lower`, pose by pose.
 
@@ -105,6 +106,7 @@ def examine(
         cofactor: (J^T W J)^-1, shape (9, 9).
         weights: shape (J,) or None.
         robust: the weight that a robust fit gave a weighted residual, m/s^2; None after least squares.
+        held: which of the nine parameters were not estimated, shape (9,).
     """
     after_sum, before_sum, weighted_sum = 0.0, 0.0, 0.0
     parts: list[tuple[Int, Float, Float, Float, Float]] = []
@@ -123,7 +125,7 @@ def examine(
     if readings.poses > KEPT:
         kept = np.sort(_worst(scaled))
         pose, scaled, w, f, before_e = (column[kept] for column in (pose, scaled, w, f, before_e))
-    residuals = _judge(pose, scaled, w, f, before_e, g, cofactor, weighted_sum, readings.poses - 9)
+    residuals = _judge(pose, scaled, w, f, before_e, g, cofactor, weighted_sum, readings.poses, held)
     return Fit(
         float(np.sqrt(after_sum / readings.poses)), float(np.sqrt(before_sum / readings.poses)), residuals
     )
@@ -143,24 +145,26 @@ def _judge(
     g: float,
     cofactor: Float,
     weighted_sum: float,
-    freedom: int,
+    poses: int,
+    held: Bool | None,
 ) -> PoseResiduals:
     """Return residuals with their leverage, studentised and with the pose left out.
 
-    Studentised residuals need freedom >= 2; `scaled` is sqrt(w) e and `weighted_sum` its squares over all poses.
+    Studentised residuals need two degrees of freedom; `scaled` is sqrt(w) e, `weighted_sum` its squares over all poses.
     """
+    freedom = poses - 9 + (0 if held is None else int(held.sum()))
     size = np.linalg.norm(f, axis=1)
     leverage = leverages(design(f / size[:, None]), w, cofactor)
     room = room_of(leverage)
     error, studentised = size - g, studentise(scaled, room, weighted_sum, freedom)
     left_out = error / room
     suspect = np.flatnonzero(is_suspect(studentised, error, freedom, g))
-    if len(pose) < freedom + 9:  # of so many poses none bends the fit, unless it is beyond all measure
+    if len(pose) < poses:  # of so many poses none bends the fit, unless it is beyond all measure
         blown = suspect[np.isnan(studentised[suspect])]
         studentised[blown] = np.copysign(np.inf, error[blown])
     elif len(suspect):
         alone = leave_out(
-            np.broadcast_to(f, (len(suspect), *f.shape)), np.tile(w, (len(suspect), 1)), suspect, g
+            np.broadcast_to(f, (len(suspect), *f.shape)), np.tile(w, (len(suspect), 1)), suspect, g, held
         )
         studentised[suspect], left_out[suspect] = alone.studentised, alone.error
     return PoseResiduals(pose, error, length_error(e_before, g), f, leverage, studentised, left_out)

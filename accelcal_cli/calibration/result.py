@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from accelcal_cli.calibration import record as records
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
-from accelcal_cli.calibration.quality import UNDETERMINED
+from accelcal_cli.calibration.quality import ALIGNED, UNDETERMINED
 from accelcal_cli.calibration.rebuild import checked
 from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.errors import DataError, UsageError
@@ -103,6 +103,11 @@ class Calibration:
     def unit(self) -> str:
         """Unit of the specific force: g when the readings were calibrated against g = 1."""
         return "g" if self.g == 1.0 else "m/s^2"
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """Which of the nine parameters were not estimated but taken as zero, shape (9,)."""
+        return np.zeros(9, dtype=bool) if self.settings.get("misalignment", True) else ALIGNED
 
     @property
     def lost(self) -> NDArray[np.bool_]:

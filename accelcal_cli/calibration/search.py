@@ -148,6 +148,9 @@ def lower_problem(problem: Loetters, model: ErrorModel) -> tuple[Loetters, Float
     """
     K = to_gauge(model.K, "lower")
     half = problem.box.half
-    half = np.concatenate([half[:, :6], half[:, -3:]], axis=1)
+    turned = (
+        half[:, 3:6] if problem.unknowns > 6 else half[:, :3]
+    )  # any width: derivatives alone are asked for
+    half = np.concatenate([half[:, :3], turned, half[:, -3:]], axis=1)
     nine = Loetters(problem.triangle, problem.g, Box(np.zeros((1, 9)), half))
     return nine, nine.coordinates(K[None], model.D[None])

@@ -20,6 +20,15 @@ LARGEST = 1e30
 """Largest scale factor or bias of a nominal sensor, output units: its fourth power is still a number."""
 
 
+ALIGNED = {
+    "gauge": ("lower", "upper", "symmetric"),
+    "robust": ("none",),
+    "weights": ("none", "n", "sd"),
+    "attitudes": ("unknown",),
+}
+"""What goes with axes that are taken as perpendicular."""
+
+
 @dataclass(frozen=True)
 class BoxSettings:
     """Half-widths of the search box around the nominal sensor."""
@@ -68,13 +77,23 @@ class Settings:
         "weight of a pose: none, n (readings averaged), sd (their scatter and n) or auto (sd beside a shared error)",
     )
     attitudes: Attitudes = setting("unknown", "known: all twelve parameters, from columns fx, fy, fz")
+    misalignment: bool = setting(
+        True, "estimate misalignments; false: take the axes as perpendicular, six unknowns"
+    )
     temperature: bool = setting(True, "slopes with temperature, where a temperature column determines them")
     box: BoxSettings = field(default_factory=BoxSettings)
     nominal: Nominal | None = setting(None, "stated nominal sensor; estimated when left out")
 
     def __post_init__(self) -> None:
-        """Refuse a setting outside its range."""
+        """Refuse a setting outside its range, and what does not go with perpendicular axes."""
         check(self)
+        if self.misalignment:
+            return
+        for key, allowed in ALIGNED.items():
+            if getattr(self, key) not in allowed:
+                raise ConfigError(
+                    f"{key}: {getattr(self, key)} does not go with misalignment: false; expected {' or '.join(allowed)}"
+                )
 
     def build_optimizer(self) -> Optimizer:
         """Return the optimizer with its parameters.

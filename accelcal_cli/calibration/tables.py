@@ -13,7 +13,7 @@ from accelcal_cli.sensor.poses import AXES
 from accelcal_cli.table import Column, Table
 
 WORST_SHOWN = 5
-UNKNOWN = "not determined"
+UNKNOWN, ASSUMED = "not determined", "taken as 0"
 
 
 def tables(result: Calibration) -> list[Table]:
@@ -93,7 +93,7 @@ def engineering(result: Calibration) -> Table:
     rows = []
     for p, name in enumerate(PARAMETERS):
         kind, unit, factor, second, second_factor = shown[p // 3]
-        pair = _pair(values[p], sigma[p], lost=bool(result.lost[p]))
+        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], sigma[p], lost=bool(result.lost[p]))
         first, again = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
         rows.append((f"{kind} {name.split()[-1]}", *first, unit, *again, second))
     columns = (
@@ -182,8 +182,11 @@ def fit(result: Calibration) -> Table:
 
 def observability(result: Calibration) -> Table:
     """Return the dilution of precision of each parameter."""
-    rows = []
-    for name, dop in result.dop.parameters.items():
+    rows: list[tuple[object, ...]] = []
+    for (name, dop), held in zip(result.dop.parameters.items(), result.held, strict=True):
+        if held:
+            rows.append((name, "-", ASSUMED))
+            continue
         word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
         rows.append((name, dop if np.isfinite(dop) else "infinite", word))
     notes = (

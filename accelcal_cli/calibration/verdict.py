@@ -41,17 +41,24 @@ def final_verdict(seen: Verdict, edge: bool, freedom: int) -> Verdict:
 
 
 def reasons_of(
-    seen: Observability, suggestions: tuple[str, ...], edge: tuple[str, ...], freedom: int
+    seen: Observability,
+    suggestions: tuple[str, ...],
+    edge: tuple[str, ...],
+    freedom: int,
+    parameters: int = 9,
 ) -> tuple[str, ...]:
-    """Return why a verdict is not good, in sentences."""
+    """Return why a verdict is not good, in sentences; freedom is the number of poses less that of parameters."""
+    number = {6: "six", 9: "nine"}[parameters]
     lines = list(quality.in_words(seen, suggestions))
     if freedom < 0:
         lines.insert(
-            0, f"{9 + freedom} poses are fewer than the nine parameters; take at least {FEWEST_POSES}."
+            0,
+            f"{parameters + freedom} poses are fewer than the {number} parameters; take at least {FEWEST_POSES}.",
         )
     if freedom == 0:
         lines.append(
-            f"Nine poses leave nothing to judge their noise by: no sigma. Take at least {FEWEST_POSES}."
+            f"{number.capitalize()} poses leave nothing to judge their noise by: no sigma. "
+            f"Take at least {FEWEST_POSES}."
         )
     if edge and seen.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
         lines.append(

@@ -185,6 +185,11 @@ def _strange(rms: float, old: Calibration) -> tuple[str, ...]:
 
 def _check(old: Calibration) -> None:
     source = old.data.get("source", "result")
+    if old.held.any():
+        raise DataError(
+            f"the result of {source} took its axes as perpendicular: there is no misalignment to compare; verify "
+            "needs a result with misalignments"
+        )
     if old.verdict == "undetermined" or not np.isfinite(old.covariance).all():
         raise DataError(
             f"the result of {source} has no uncertainty for all nine parameters (verdict {old.verdict}, "

@@ -52,6 +52,13 @@ def command(
         str | None,
         typer.Option(help="unknown, or known: from columns fx, fy, fz.", show_default="unknown"),
     ] = None,
+    misalignment: Annotated[
+        bool | None,
+        typer.Option(
+            help="Estimate misalignments; without, the axes are taken as perpendicular.",
+            show_default="misalignment",
+        ),
+    ] = None,
     temperature: Annotated[
         bool | None,
         typer.Option(
@@ -110,6 +117,7 @@ def command(
         "weights": weights,
         "polish": polish,
         "attitudes": attitudes,
+        "misalignment": misalignment,
         "temperature": temperature,
     }
     parameters = {"population": population, "iterations": iterations}

@@ -1,0 +1,107 @@
+"""Six unknowns: scale factors and biases of a sensor whose axes are taken as perpendicular."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from simulated import DPSO, noise
+
+from accelcal_cli.calibration.fleet import check_settings
+from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.tables import tables
+from accelcal_cli.calibration.verify import verify
+from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.optimizers.base import OPTIMIZERS
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.readings import Readings
+
+G = 9.8
+ALIGNED = ErrorModel(np.diag(np.diagonal(DPSO.K)), DPSO.D)
+SIX = Settings(optimizer="levenberg-marquardt", g=G, misalignment=False)
+
+
+def read(u, sigma=0.0, seed=1, sensor=ALIGNED):
+    return Readings.from_array(sensor.output(G * u + noise(len(u), sigma, seed)))
+
+
+@pytest.mark.parametrize(
+    "optimizer", [name for name in OPTIMIZERS.names() if name not in ("foa", "full-foa", "kpso")]
+)
+def test_six_faces_determine_scale_factors_and_biases(optimizer):
+    """Exactly, from readings without noise; six poses leave no degree of freedom, so the verdict is weak."""
+    result = calibrate(read(poses.faces()), replace(SIX, optimizer=optimizer))
+    np.testing.assert_allclose(result.K_a, ALIGNED.K, atol=1e-9 * ALIGNED.K[0, 0])
+    np.testing.assert_allclose(result.D_a, ALIGNED.D, atol=1e-8 * ALIGNED.K[0, 0])
+    assert (result.verdict, result.freedom) == ("weak", 0)
+    assert result.reasons == ("Six poses leave nothing to judge their noise by: no sigma. Take at least 12.",)
+    assert result.dop.scale == pytest.approx(np.sqrt(0.5), rel=1e-2)
+    assert result.dop.misalignment == 0
+    assert any("taken as perpendicular" in caution for caution in result.cautions)
+    assert Calibration.from_record(result.record(), "r").held.sum() == 3
+
+
+def test_the_fit_is_that_of_scipy():
+    data = read(poses.turns(), sigma=1e-2)
+    result = calibrate(data, SIX)
+
+    def residuals(x):
+        f = (data.output() - x[3:] * 1e6) / (x[:3] * 1e6)
+        return G * G - np.sum(f * f, axis=1)
+
+    start = np.append(np.diagonal(ALIGNED.K), ALIGNED.D) / 1e6
+    found = least_squares(residuals, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x * 1e6
+    np.testing.assert_allclose(np.append(np.diagonal(result.K_a), result.D_a), found, rtol=1e-6)
+    assert (result.verdict, result.freedom) == ("good", 18)
+
+
+def test_sigma_is_the_scatter_of_the_estimates():
+    """300 calibrations from twelve edges, six degrees of freedom each."""
+    found, stated = [], []
+    for seed in range(300):
+        result = calibrate(read(poses.edges(), sigma=1e-2, seed=seed), SIX)
+        found.append(np.append(np.diagonal(result.K_a), result.D_a))
+        stated.append(np.append(np.diagonal(result.sigma.K_a), result.sigma.D_a))
+    ratio = np.sqrt(np.mean(np.square(stated), axis=0)) / np.std(found, axis=0)
+    assert ratio.mean() == pytest.approx(1.0, abs=0.05)
+    assert result.sigma.K_a[1, 0] == 0
+
+
+def test_a_wrong_pose_is_named():
+    data = ALIGNED.output(G * poses.edges() + noise(12, 1e-3, 3))
+    data[4] *= 1.05
+    assert 4 in calibrate(Readings.from_array(data), SIX).outliers
+
+
+def test_too_few_poses_are_told():
+    result = calibrate(read(poses.faces()[:5]), SIX)
+    assert result.verdict == "undetermined"
+    assert result.reasons[0] == "5 poses are fewer than the six parameters; take at least 12."
+    assert any("do not determine" in reason for reason in result.reasons)
+
+
+def test_a_table_says_what_was_assumed():
+    shown = {table.title: table for table in tables(calibrate(read(poses.turns(), sigma=1e-2), SIX))}
+    assert [row[1] for row in shown["Engineering view"].rows[3:6]] == ["taken as 0"] * 3
+    assert [row[1:] for row in shown["Observability"].rows[3:6]] == [("-", "taken as 0")] * 3
+
+
+@pytest.mark.parametrize(
+    "other", [{"gauge": "full"}, {"robust": "huber"}, {"weights": "auto"}, {"attitudes": "known"}]
+)
+def test_what_does_not_go_with_it_is_refused(other):
+    (key,) = other
+    with pytest.raises(ConfigError, match=f"{key}: {other[key]} does not go with misalignment: false"):
+        replace(SIX, **other)
+
+
+def test_fleet_and_verify_want_misalignments():
+    with pytest.raises(ConfigError, match="misalignment: False"):
+        check_settings(SIX)
+    with pytest.raises(DataError, match="took its axes as perpendicular"):
+        verify(calibrate(read(poses.turns(), sigma=1e-2), SIX), read(poses.turns(), sigma=1e-2, seed=2))
