@@ -36,7 +36,7 @@ def accuracy(result: Calibration) -> str:
         return ""
     sigma = np.sqrt(variance) / result.g
     largest = [(name, sigma[kind].max() * size, unit) for name, kind, unit, size in KINDS]
-    parts = [f"{name} {value:{'.2g' if value < 100 else ',.0f'}} {unit}" for name, value, unit in largest]
+    parts = [f"{name} {v:{'.2g' if v < 100 else ',.0f'}} {unit}" for name, v, unit in largest if v > 0]
     return f"Largest one-sigma of each kind: {', '.join(parts)}."
 
 

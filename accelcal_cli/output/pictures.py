@@ -71,8 +71,8 @@ def convergence(result: Calibration) -> str:
 
 
 def dilution(result: Calibration) -> str:
-    """Return the dilution of precision of the nine parameters as bars, with the two thresholds."""
-    names = list(result.dop.parameters)
+    """Return the dilution of precision of the parameters that were estimated as bars, with the two thresholds."""
+    names = [name for name, held in zip(result.dop.parameters, result.held, strict=True) if not held]
     dop = np.array([result.dop.parameters[name] for name in names])
     known = np.isfinite(dop)
     end = 1.3 * max(UNDETERMINED, dop[known].max(initial=0.0))

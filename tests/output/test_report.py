@@ -36,10 +36,12 @@ def _result(kind):
         return calibrate(Readings.from_array(output), Settings(**search, robust="huber"))
     if kind == "undetermined":
         return calibrate(readings(np.tile(poses.faces(), (2, 1)), sigma=1e-3), Settings(**search))
+    if kind == "perpendicular":
+        return calibrate(readings(poses.turns(), sigma=0.1), Settings(**search, misalignment=False))
     return calibrate(readings(poses.fibonacci(1200), sigma=1e-3), Settings(**search))
 
 
-KINDS = ("good", "outlier", "undetermined", "many")
+KINDS = ("good", "outlier", "undetermined", "perpendicular", "many")
 
 
 @functools.cache
@@ -108,6 +110,13 @@ def test_the_verdict_comes_first(kind):
     assert text.index(f"Verdict: {result.verdict}") < text.index("Parameters")
     for sentence in (*result.reasons, *result.cautions, *result.notes, result.before):
         assert typeset(sentence) in text
+
+
+def test_what_was_not_estimated_is_not_shown_as_if_it_were():
+    text = Reader(_page("perpendicular")).text
+    assert "The poses determine all six parameters that were estimated." in text
+    assert "misalignment 0" not in text
+    assert "misalignment" not in _drawings("perpendicular")["dilution"]
 
 
 def test_a_page_holds_every_part(good):
