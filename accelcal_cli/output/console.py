@@ -149,7 +149,10 @@ def verdict(
     word: str, sentences: Iterable[str], out: Console, cautions: Iterable[str] = (), title: str = "Verdict"
 ) -> None:
     """Print the verdict, what it rests on, and what it does not look at."""
-    out.print(Text.assemble((f"{title}: ", "bold"), (word, VERDICT_STYLE.get(word, "bold"))))
+    cautions, style = list(cautions), VERDICT_STYLE.get(word, "bold")
+    if cautions and style == VERDICT_STYLE["good"]:  # no green light with a warning under it
+        style = VERDICT_STYLE["weak"]
+    out.print(Text.assemble((f"{title}: ", "bold"), (word, style)))
     for sentence in sentences:
         out.print(Text(f"  {sentence}"))
     for caution in cautions:
