@@ -10,6 +10,7 @@ Arrays come out as (R, P, D) with the population axis contiguous in memory: oper
 from __future__ import annotations
 
 from collections.abc import Iterable
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -21,16 +22,37 @@ Int = NDArray[np.intp]
 Bool = NDArray[np.bool_]
 
 
+class Purpose(IntEnum):
+    """What numbers are drawn for: under one seed each purpose has streams of its own.
+
+    The values are part of every seeded result: a new purpose takes a new number, and none is changed.
+    """
+
+    SEARCH = 0  # everything that an optimizer draws
+    BOX = 1  # the middle of a search box, off the truth
+    NOISE = 2  # of readings
+    ATTITUDE = 3  # of poses
+    RAW_LOG = 4  # a hold or a move of a raw log
+    SHIFT = 4  # place and rotation of a test function: no command has both, and both have printed results
+    SENSOR = 5  # error parameters
+    START = 6  # starting population around the nominal sensor
+    PLAN = 7  # sets of poses that an exchange starts from
+    FIELD = 20  # gravity map
+    INS = 21  # errors of an inertial navigation system
+    GRAVIMETER = 22  # noise of measured gravity
+    FILTER = 23  # everything that a navigation filter draws
+
+
 class Streams:
     """R independent generators, one a run.
 
     Args:
         seed: the study's seed, a non-negative integer.
         runs: the numbers of the runs; run r draws the same whatever the others are.
-        purpose: separates draws of different use (search, noise, ...) under one seed.
+        purpose: of the draws, see `Purpose`.
     """
 
-    def __init__(self, seed: int, runs: Iterable[int], purpose: int = 0) -> None:
+    def __init__(self, seed: int, runs: Iterable[int], purpose: int = Purpose.SEARCH) -> None:
         """Seed one generator for every run from (seed, purpose, run), when the first number is drawn."""
         if seed < 0:
             raise ValueError(f"seed: {seed} is negative; expected 0 or more")

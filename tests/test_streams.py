@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from accelcal_cli.streams import Streams
+import accelcal_cli
+from accelcal_cli.streams import Purpose, Streams
 
 
 @given(
@@ -83,3 +87,20 @@ def test_what_a_part_has_drawn_is_not_drawn_again():
     streams = Streams(0, range(3))
     first = streams.take(np.array([1])).normal(4, 2)
     assert (streams.normal(4, 2)[1] != first[0]).all()
+
+
+def test_purposes_differ():
+    """All but two, which no command has together: SHIFT is another name of RAW_LOG."""
+    shared = {name for name, purpose in Purpose.__members__.items() if purpose.name != name}
+    assert shared == {"SHIFT"}
+
+
+def test_every_stream_of_the_library_states_its_purpose_by_name():
+    """A number, or a purpose of a module's own, could be another's."""
+    package = Path(accelcal_cli.__file__).parent
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "Streams":
+                stated = [*node.args[2:], *(key.value for key in node.keywords)]
+                named = [ast.unparse(purpose).startswith("Purpose.") for purpose in stated]
+                assert named in ([], [True]) or path.name == "streams.py", f"{path}:{node.lineno}"

@@ -6,19 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.sensor.model import ErrorModel
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from accelcal_cli.streams import Float, Int
 
 
-def directions_of(output: Floats, model: ErrorModel) -> Floats:
+def directions_of(output: Float, model: ErrorModel) -> Float:
     """Return the unit directions of the specific force of outputs, both shape (J, 3)."""
     force = model.specific_force(output)
-    unit: Floats = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
+    unit: Float = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
     return unit
 
 
-def attitudes(u: Floats, n: NDArray[np.int64], angle: float) -> list[Indices]:
+def attitudes(u: Float, n: NDArray[np.int64], angle: float) -> list[Int]:
     """Group directions: the longest pose that is left takes all within `angle`, until none is left.
 
     Args:

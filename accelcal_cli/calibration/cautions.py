@@ -30,9 +30,10 @@ STOPPED_SHORT = 0.01
 EARTH = 9.76, 9.84
 """Gravity on Earth, m/s^2, from the top of the Andes to the Arctic Ocean."""
 
-NOISE_BIAS = 3.0
-"""Isotropic noise of standard deviation s makes scale factors too large by about 3 (s/g)^2: |f|^2 grows by 3 s^2
-on average, and the noise in the products of outputs doubles it. Measured at s/g from 0.02 to 0.1."""
+NOISE_BIAS = 3.5
+"""Isotropic noise of standard deviation s, in units of g, makes scale factors too large by about 3.5 s^2: of c that
+minimises E (1 - c^2 |u + n|^2)^2, c^2 = E |u + n|^2 / E |u + n|^4 = (1 + 3 s^2) / (1 + 10 s^2 + 15 s^4), and the scale
+factor is 1 / c."""
 
 
 def cautions(

@@ -12,9 +12,8 @@ from accelcal_cli.calibration.lotters import Box, Loetters, pack
 from accelcal_cli.calibration.quality import Observabilities, information
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
-from accelcal_cli.streams import Bool, Float, Int, Streams
+from accelcal_cli.streams import Bool, Float, Int, Purpose, Streams
 
-BOX_PURPOSE = 1
 """Stream of the random shift of the box, apart from the searches' own streams."""
 
 SHIFT = 0.5
@@ -72,7 +71,7 @@ def search_box(triangle: Triangle, settings: Settings) -> Start:
         K[index] = to_gauge(K[index], "symmetric")
     K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
     box = _box(K, D, settings, unknowns)
-    u = Streams(settings.seed, [0], purpose=BOX_PURPOSE).uniform(1, unknowns)[0, 0]
+    u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
     moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
     return Start(
         Box(np.where(closed[:, None], moved, box.centre), box.half),

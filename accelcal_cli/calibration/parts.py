@@ -48,8 +48,18 @@ class Dop:
 
 @dataclass(frozen=True)
 class PoseFit:
-    """One pose: `where` in the input, |f| - g before leaving it out and after, leverage, studentised residual;
-    |f| - g before calibration, and the unit direction of the specific force, gauge `lower`."""
+    """One pose. Units: m/s^2 (units of g when g = 1).
+
+    Attributes:
+        pose: its number, from 0; where: its line or label in the input.
+        residual: |f| - g; with known attitudes |f| - |reference|.
+        studentised: residual over its standard deviation, by the s of the other poses; with known attitudes by the s
+            of all poses.
+        leverage: part of its own residual that the fit absorbs.
+        left_out: the residual that a fit without the pose would leave.
+        residual_before: |f| - g before calibration.
+        direction: unit vector of the specific force, gauge `lower`.
+    """
 
     pose: int
     where: str

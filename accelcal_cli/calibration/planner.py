@@ -6,7 +6,7 @@ import numpy as np
 
 from accelcal_cli.calibration.quality import PRIOR, design
 from accelcal_cli.sensor.poses import corners, edges, faces, grid
-from accelcal_cli.streams import Float, Int, Streams
+from accelcal_cli.streams import Float, Int, Purpose, Streams
 
 FIXTURES = ("faces", "edges", "corners", "any")
 """What the sensor can be held against: each allows what those before it allow."""
@@ -21,7 +21,6 @@ SUM_WEIGHT = 1e-3
 DIGITS = 9
 """Decimals of a score: rounding decides between equal candidates otherwise, and with it the machine."""
 
-START_PURPOSE = 7
 STARTED_POSES, FEWEST_STARTS = 300, 2
 """Random starts of an exchange: 300 poses over the number chosen, 2 at least."""
 
@@ -75,7 +74,7 @@ def best_poses(information: Float, candidates: Float, count: int) -> list[int]:
     candidate that suits the others best, until none is. From the greedy choice and from random ones, the best kept.
     """
     rows = design(candidates)
-    starts = Streams(0, range(max(FEWEST_STARTS, STARTED_POSES // count)), purpose=START_PURPOSE)
+    starts = Streams(0, range(max(FEWEST_STARTS, STARTED_POSES // count)), Purpose.PLAN)
     drawn = (starts.uniform(1, count)[:, 0] * len(rows)).astype(np.intp)
     greedy = np.array(next_poses(information, candidates, count), dtype=np.intp)
     kept, least = greedy, np.inf

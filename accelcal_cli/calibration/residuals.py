@@ -1,4 +1,4 @@
-"""Residuals pose by pose: fit, leverage, leave-one-out error, outliers; and the robust weights."""
+"""Residuals pose by pose: fit, leverage, leave-one-out error, outliers."""
 
 from __future__ import annotations
 

@@ -38,19 +38,25 @@ class Calibration:
         cautions: sentences about residuals and search that do not change the verdict, which is of the poses.
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
-        s: standard deviation of one pose's modulus, m/s^2, from J - 9 degrees of freedom; NaN without any.
+        s: standard deviation of one pose's modulus, m/s^2, with known attitudes of one axis; NaN without freedom.
+        freedom: J - 9 degrees of freedom, J - 15 with slopes with temperature, 3 J - 12 with known attitudes.
+        noise_ratio, noise_chance: s over what the scatter within the poses predicts, and the chance of so large a
+            ratio; None where nothing tells them.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9); NaN where they have no sigma.
         information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
-        poses: J; freedom: J - 9.
+        poses: J.
         evaluations: of the cost, search and polish together.
         runs, runs_agreeing: searches made, and how many ended in the best one's minimum.
-        poses_worst: residuals pose by pose (all up to 1000 poses, the worst 20 of more).
+        poses_fit: residuals pose by pose (all up to 1000 poses, the worst 20 of more).
+        outliers: numbers of the poses that do not fit, from 0.
         convergence: best cost so far against evaluations, of the best run, thinned.
         optimizer: its name; settings: everything needed to repeat the run.
+        g: local gravity, m/s^2, or 1.
         data: source, sha256, columns of the readings.
         notes: sentences about the data and the search that a user should know.
+        version: of accelcal; schema: SCHEMA.
         temperature: slopes with temperature, when the readings determine them.
     """
 

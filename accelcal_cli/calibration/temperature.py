@@ -136,9 +136,7 @@ def at(readings: Readings, output: Float) -> Readings:
     """Return readings with other outputs, shape (J, 3)."""
     store = RowStore()
     store.append(np.asarray(output, dtype=np.float64))
-    return replace(
-        readings, lower=output.min(axis=0), upper=output.max(axis=0), mean=output.mean(axis=0), _store=store
-    )
+    return replace(readings, lower=output.min(axis=0), upper=output.max(axis=0), _store=store)
 
 
 def _unsuitable(readings: Readings) -> str:

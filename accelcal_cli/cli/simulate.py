@@ -73,9 +73,9 @@ def command(
     from accelcal_cli.registry import build
     from accelcal_cli.sensor.motion import Handling, handled
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, simulate, simulate_fleet
+    from accelcal_cli.sensor.simulation import simulate, simulate_fleet
     from accelcal_cli.sensor.units import STANDARD_GRAVITY
-    from accelcal_cli.streams import Streams
+    from accelcal_cli.streams import Purpose, Streams
 
     if noise is not None and not 0 <= noise <= LARGEST_NOISE:
         raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
@@ -98,7 +98,7 @@ def command(
             check_target(path)
     local_g = options.gravity(g, latitude, height) or STANDARD_GRAVITY
     device = load_sensor(sensor)
-    u = directions(positions, scheme, Streams(seed, [0], purpose=ATTITUDE_PURPOSE).normal(positions, 3)[0])
+    u = directions(positions, scheme, Streams(seed, [0], Purpose.ATTITUDE).normal(positions, 3)[0])
     sigma = device.noise if noise is None else noise
     record = _truth(device, local_g, sigma, u)
     with whole_file(output) as file:

@@ -47,10 +47,10 @@ class DePf(Evolving):
     swell: float = setting(
         4.0, "growth of the covariance when no track explains a window; 1: none", low=1.0, high=100.0
     )
-    F_min: float = setting(0.4, "least F [depf2015]", low=0.0, high=2.0)
-    F_max: float = setting(1.0, "largest F [depf2015]", low=0.0, high=2.0)
-    CR_min: float = setting(0.0, "least CR [depf2015]", low=0.0, high=1.0)
-    CR_max: float = setting(1.0, "largest CR [depf2015]", low=0.0, high=1.0)
+    weight_min: float = setting(0.4, "F of the best particle (F_min) [depf2015]", low=0.0, high=2.0)
+    weight_max: float = setting(1.0, "F of the worst particle (F_max) [depf2015]", low=0.0, high=2.0)
+    crossover_min: float = setting(0.0, "CR of the worst mutant (CR_min) [depf2015]", low=0.0, high=1.0)
+    crossover_max: float = setting(1.0, "CR of the best mutant (CR_max) [depf2015]", low=0.0, high=1.0)
     mutation: Literal["best-r", "current-to-best", "rand-to-best"] = setting(
         "best-r", "reading of the mutation: m + F (best - r), current-to-best/1 or rand-to-best/1"
     )
@@ -74,7 +74,9 @@ class DePf(Evolving):
 
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
         """Return the particles after the paper's generations; see `Evolving.evolve`."""
-        operators = Operators(self.F_min, self.F_max, self.CR_min, self.CR_max, self.mutation)
+        operators = Operators(
+            self.weight_min, self.weight_max, self.crossover_min, self.crossover_max, self.mutation
+        )
         return evolve(operators, x, fitness, movers, self.generations, rate, streams)
 
     @property

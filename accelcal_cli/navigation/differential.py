@@ -1,4 +1,9 @@
-"""Differential evolution of position particles: the paper's operators, and its Markov chain kin [terbraak2006]."""
+"""Differential evolution of position particles: the paper's operators, and its Markov chain kin [terbraak2006].
+
+Names are those of optimizers.ade, which minimises a cost by the same equations. Here the fitness is a logarithm and its
+exponential, the weight, is maximised, as the paper does; the mutation is best-r unless stated, as its text reads; and
+only the first particles move, while best and worst are of all.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +16,8 @@ from accelcal_cli.navigation.particle import Fitness
 from accelcal_cli.streams import Float, Int, Streams
 
 LAMBDA = 1e-13
+"""Keeps the ratios finite when all weights are equal; the paper's value."""
+
 JITTER = 1e-3
 """Noise of a Metropolis proposal, in sigma: without it the chain would stay in the span of the cloud."""
 
@@ -20,12 +27,12 @@ REACH = 2.38
 
 @dataclass(frozen=True)
 class Operators:
-    """[depf2015] section 2: F and CR adapt to every individual. Names as there."""
+    """[depf2015] section 2: F and CR adapt to every individual."""
 
-    F_min: float = 0.4
-    F_max: float = 1.0
-    CR_min: float = 0.0
-    CR_max: float = 1.0
+    weight_min: float = 0.4
+    weight_max: float = 1.0
+    crossover_min: float = 0.0
+    crossover_max: float = 1.0
     mutation: Literal["best-r", "current-to-best", "rand-to-best"] = "best-r"
 
 
@@ -51,15 +58,18 @@ def evolve(
         best = fitness.argmax(axis=1)[:, None]
         level = np.take_along_axis(fitness, best, axis=1)
         leader = np.take_along_axis(x, best[:, :, None], axis=1)
-        behind = 1.0 - np.exp(fitness - level)
-        worst = behind.max(axis=1, keepdims=True) + LAMBDA
-        F = operators.F_min + (operators.F_max - operators.F_min) * behind[:, :movers] / worst  # eq. 4
+        distance = 1.0 - np.exp(fitness - level)
+        worst = distance.max(axis=1, keepdims=True) + LAMBDA
+        spread = operators.weight_max - operators.weight_min
+        F = operators.weight_min + spread * distance[:, :movers] / worst  # eq. 4
         draws = streams.uniform(movers, 5)
         mutant = _mutants(operators.mutation, x, leader, F[:, :, None], draws, count, movers)
-        short = np.maximum(1.0 - np.exp(rate(mutant) - level), 0.0) / worst
-        CR = operators.CR_max - (operators.CR_max - operators.CR_min) * np.minimum(short, 1.0)  # eq. 6
-        forced = (draws[..., 2:3] * 2).astype(np.intp) == np.arange(2)
-        trial = np.where((draws[..., 3:5] <= CR[:, :, None]) | forced, mutant, x[:, :movers])  # eq. 5
+        mutant_distance = np.maximum(1.0 - np.exp(rate(mutant) - level), 0.0) / worst
+        spread = operators.crossover_max - operators.crossover_min
+        CR = operators.crossover_max - spread * np.minimum(mutant_distance, 1.0)  # eq. 6
+        gene = (draws[..., 2:3] * 2).astype(np.intp)
+        take = (draws[..., 3:5] <= CR[:, :, None]) | (gene == np.arange(2))
+        trial = np.where(take, mutant, x[:, :movers])  # eq. 5
         value = rate(trial)
         better = value > fitness[:, :movers]  # eq. 7
         x[:, :movers] = np.where(better[:, :, None], trial, x[:, :movers])

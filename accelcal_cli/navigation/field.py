@@ -13,9 +13,7 @@ import numpy as np
 
 from accelcal_cli.navigation.earth import metres_per_radian
 from accelcal_cli.navigation.gravity_map import GravityMap
-from accelcal_cli.streams import Float, Streams
-
-FIELD_PURPOSE = 20
+from accelcal_cli.streams import Float, Purpose, Streams
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ def generate(field: Field, seed: int, source: str = "generated") -> GravityMap:
     dy = np.minimum(np.arange(2 * rows), 2 * rows - np.arange(2 * rows)) * step * north_metres / 1e3
     dx = np.minimum(np.arange(2 * columns), 2 * columns - np.arange(2 * columns)) * step * east_metres / 1e3
     spectrum = np.fft.fft2(covariance(np.hypot(dy[:, None], dx[None, :]), field)).real
-    noise = Streams(seed, [0], FIELD_PURPOSE).normal(2 * rows, 4 * columns)[0]
+    noise = Streams(seed, [0], Purpose.FIELD).normal(2 * rows, 4 * columns)[0]
     white = noise[:, : 2 * columns] + 1j * noise[:, 2 * columns :]
     drawn = np.fft.fft2(np.sqrt(np.maximum(spectrum, 0.0) / spectrum.size) * white).real
     return GravityMap(south, west, step, step, drawn[:rows, :columns], source)

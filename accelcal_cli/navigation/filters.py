@@ -13,8 +13,6 @@ from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import Registry
 from accelcal_cli.streams import Float, Streams
 
-FILTER_PURPOSE = 23
-
 
 @dataclass(frozen=True)
 class Track:

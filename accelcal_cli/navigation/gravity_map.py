@@ -6,7 +6,6 @@ particles to it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,8 +15,6 @@ from accelcal_cli.streams import Bool, Float, Int
 
 OUTSIDE = -1e6
 """Log-likelihood of a place that the map does not know."""
-
-ARC_MINUTE = math.radians(1.0 / 60.0)
 
 
 @dataclass(frozen=True)
@@ -97,17 +94,3 @@ class GravityMap:
         i *= columns
         i += j
         return i.astype(np.intp), a, b, outside
-
-    def statistics(self) -> dict[str, float]:
-        """Return sigma (mGal), the rms slope (mGal/km) and the mean step over 1' (mGal)."""
-        middle = math.cos(0.5 * (self.south + self.north))
-        km = 6371.0
-        north = np.diff(self.values, axis=0) / (self.step_north * km)
-        east = np.diff(self.values, axis=1) / (self.step_east * km * middle)
-        stride = max(1, round(ARC_MINUTE / self.step_north))
-        steps = np.abs(self.values[stride:] - self.values[:-stride])
-        return {
-            "sigma": float(np.nanstd(self.values)),
-            "slope": float(np.sqrt(0.5 * (np.nanmean(north**2) + np.nanmean(east**2)))),
-            "step": float(np.nanmean(steps)),
-        }

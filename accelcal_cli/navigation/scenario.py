@@ -11,10 +11,9 @@ import numpy as np
 from accelcal_cli.navigation.earth import metres_per_radian
 from accelcal_cli.navigation.error_model import STATES, Grade, discretise, dynamics, metric, turned
 from accelcal_cli.navigation.gravity_map import GravityMap
-from accelcal_cli.navigation.voyage import INS_PURPOSE, SECONDS_PER_HOUR, Plan, Route, ins_errors, planned
-from accelcal_cli.streams import Float, Int, Streams
+from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR, Plan, Route, ins_errors, planned
+from accelcal_cli.streams import Float, Int, Purpose, Streams
 
-GRAVITY_PURPOSE = 22
 VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA = 0.6, 1e-4, 1e-3
 """Of the prior, chosen: m/s, rad, rad."""
 
@@ -139,7 +138,7 @@ def simulate(
     """
     route = planned(plan)
     every = round(period)
-    x = ins_errors(plan, route, grade, Streams(seed, runs, INS_PURPOSE), every)
+    x = ins_errors(plan, route, grade, Streams(seed, runs, Purpose.INS), every)
     start = round(plan.filtered * SECONDS_PER_HOUR)
     keep = start + every * np.arange(x.shape[1])
     true = Route(
@@ -155,7 +154,7 @@ def simulate(
     meridian, parallel = metres_per_radian(ins.latitude)
     error = np.stack([x[:, :, 0] * meridian, x[:, :, 1] * parallel], axis=-1)
     anomaly = gravity_map.at(true.latitude, true.longitude)
-    drawn = Streams(seed, runs, GRAVITY_PURPOSE).normal(1, len(keep))[:, 0]
+    drawn = Streams(seed, runs, Purpose.GRAVIMETER).normal(1, len(keep))[:, 0]
     return Scenario(
         gravity_map,
         believed or grade,

@@ -18,7 +18,6 @@ from accelcal_cli.navigation.error_model import STATES, Grade, Motion, dynamics,
 from accelcal_cli.registry import check, setting
 from accelcal_cli.streams import Float, Streams
 
-INS_PURPOSE = 21
 SECONDS_PER_HOUR = 3600.0
 CHUNK = 600
 """Seconds of noise that are drawn together."""

@@ -19,9 +19,9 @@ from accelcal_cli.errors import DataError, did_you_mean
 from accelcal_cli.navigation.earth import metres_per_radian
 from accelcal_cli.navigation.error_model import Grade
 from accelcal_cli.navigation.gravity_map import GravityMap
-from accelcal_cli.navigation.scenario import GRAVITY_PURPOSE, Scenario
+from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.navigation.voyage import Route, wrapped
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Float, Purpose, Streams
 
 NEEDED = ("time", "latitude", "longitude")
 FURTHER = ("gravity", "east", "north", "heading", "true_latitude", "true_longitude")
@@ -141,7 +141,7 @@ def recorded(
     if voyage.has("gravity"):
         measured = np.broadcast_to(own["gravity"], shape)
     else:
-        drawn = Streams(seed, runs, GRAVITY_PURPOSE).normal(1, shape[1])[:, 0]
+        drawn = Streams(seed, runs, Purpose.GRAVIMETER).normal(1, shape[1])[:, 0]
         measured = gravity_map.at(route.latitude, route.longitude) + noise * drawn
     turns = wrapped(np.diff(np.radians(own["heading"]))) if voyage.has("heading") else indicated.turns()
     return Scenario(gravity_map, grade, noise, initial, own["time"], ins, measured, error, route, turns)

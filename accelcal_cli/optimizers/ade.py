@@ -1,8 +1,12 @@
 """ADE: differential evolution with F and CR of each individual adapted to its rank [depf2015].
 
-The evolution inside the DE-PF particle filter, as an optimizer of its own: rand-to-best mutation, a large F for an
-individual far from the best cost, a large CR for a promising mutant, greedy selection. The paper maximises a weight;
-here a cost is minimised, with the same differences of cost.
+The evolution inside the DE-PF particle filter, as an optimizer of its own: a large F for an individual far from the
+best cost, a large CR for a promising mutant, greedy selection. The paper maximises a weight; here a cost is minimised,
+with the same differences of cost.
+
+Names are those of navigation.differential, which moves particles by the same equations and differs in three things: it
+maximises the weight, its mutation is best-r unless stated, and only the first of its particles may move, while best
+and worst are of all. Here the mutation is current-to-best, because best-r stalls on a cost (docs/optimizers/ade.md).
 """
 
 from __future__ import annotations
@@ -42,9 +46,9 @@ class AdaptiveEvolution(Optimizer):
     weight_max: float = setting(1.0, "F of the worst individual (F_max)", above=0, high=2)
     crossover_min: float = setting(0.0, "CR of the worst mutant (CR_min)", low=0, high=1)
     crossover_max: float = setting(1.0, "CR of the best mutant (CR_max)", low=0, high=1)
-    difference: Literal["best", "random"] = setting(
-        "random",
-        "best: F (best - m_r) as the paper's text reads; random: + F (m_r1 - m_r2), current-to-best/1",
+    mutation: Literal["best-r", "current-to-best"] = setting(
+        "current-to-best",
+        "best-r: m + F (best - m_r) as the paper's text reads; current-to-best: m + F (best - m) + F (m_r1 - m_r2)",
     )
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> State:
@@ -73,7 +77,7 @@ class AdaptiveEvolution(Optimizer):
         population = x.shape[1]
         towards = best_of(x, fx)[:, None] - x
         first, second = partners(integers(u, population - 1, population - 2))
-        if self.difference == "best":
+        if self.mutation == "best-r":
             towards = towards + x - gather(x, first)
         else:
             towards += gather(x, first) - gather(x, second)

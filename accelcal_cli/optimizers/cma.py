@@ -1,6 +1,8 @@
 """CMA-ES, the covariance matrix adaptation evolution strategy, batched over runs [hansen2016].
 
-Equation numbers are those of the tutorial, arXiv 1604.00772, with its default constants. Phase two of SHADE-CMA.
+Equation numbers are those of the tutorial, arXiv 1604.00772, with its default constants but one thing: its negative
+weights of the worse half (active CMA) are left out, so that the weights are positive and sum to 1. Phase two of
+SHADE-CMA.
 """
 
 from __future__ import annotations

@@ -21,13 +21,16 @@ from accelcal_cli.problem import Problem
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Bool, Float, Int, Streams
 
+TERMINAL = np.nan
+"""Value of M_CR that is never left: CR is 0 from then on, one gene at a time [tanabe2014]."""
+
 
 @dataclass(frozen=True, eq=False)
 class ShadeState(State):
     """Phase one: the population with its memories and archive."""
 
     weights: Float  # M_F, (R, H)
-    rates: Float  # M_CR, (R, H)
+    rates: Float  # M_CR, TERMINAL once CR = 0 alone succeeded, (R, H)
     position: Int  # next memory entry to write, (R,)
     archive: Float  # (R, A, D)
     archived: Int  # entries in use, (R,)
@@ -96,8 +99,9 @@ class ShadeCma(Optimizer):
         gain = np.where(better, fx - trial_cost, 0.0)
         state = self._learn(state, F, CR, gain)
         state = self._archive(state, better, rng.uniform(population, 1)[..., 0])
-        x = np.where(better[..., None], trial, x)
-        fx = np.where(trial_cost <= fx, trial_cost, fx)
+        # A tie moves the individual too, and teaches nothing: on a plateau the population drifts.
+        moves = trial_cost <= fx
+        x, fx = np.where(moves[..., None], trial, x), np.where(moves, trial_cost, fx)
         return self._reduce(replace(state, x=x, fx=fx, used=state.used + population))
 
     def _draw(self, state: ShadeState, u: Float, v: Float, rng: Streams) -> tuple[Float, Float]:
@@ -110,7 +114,7 @@ class ShadeCma(Optimizer):
         least = 0.5 + np.arctan(-centre / 0.1) / np.pi
         F = centre + 0.1 * np.tan(np.pi * (least + (1.0 - least) * v - 0.5))
         CR = np.take_along_axis(state.rates, entry, axis=1) + 0.1 * rng.normal(state.x.shape[1], 1)[..., 0]
-        return np.clip(F, 1e-12, 1.0), np.clip(CR, 0.0, 1.0)
+        return np.clip(F, 1e-12, 1.0), np.where(np.isnan(CR), 0.0, np.clip(CR, 0.0, 1.0))
 
     def _mutants(self, state: ShadeState, F: Float, u: Float) -> Float:
         """Return x + F (x_pbest - x) + F (x_r1 - x_r2), r2 from population and archive."""
@@ -135,7 +139,10 @@ class ShadeCma(Optimizer):
         return mutant
 
     def _learn(self, state: ShadeState, F: Float, CR: Float, gain: Float) -> ShadeState:
-        """Write the weighted Lehmer means of the successful F and CR into the next memory entry."""
+        """Write the weighted Lehmer means of the successful F and CR into the next memory entry.
+
+        M_CR becomes TERMINAL when every successful CR is 0, and stays so.
+        """
         total = gain.sum(axis=1)
         learned = (total > 0) & np.isfinite(total)
         w = gain / np.where(learned, total, 1.0)[:, None]
@@ -143,7 +150,8 @@ class ShadeCma(Optimizer):
         weights, rates = state.weights.copy(), state.rates.copy()
         entry = state.position[rows]
         weights[rows, entry] = _lehmer(w[rows], F[rows])
-        rates[rows, entry] = _lehmer(w[rows], CR[rows])
+        ended = np.isnan(rates[rows, entry]) | ~(CR[rows] * (gain[rows] > 0)).any(axis=1)
+        rates[rows, entry] = np.where(ended, TERMINAL, _lehmer(w[rows], CR[rows]))
         position = np.where(learned, (state.position + 1) % self.memory, state.position)
         return replace(state, weights=weights, rates=rates, position=position)
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.dialect import BOM, Dialect, decode_line, is_blank
+from accelcal_cli.streams import Float
 
 LIMIT = 1e100  # larger values cannot be squared safely
 SHOWN = 40  # characters of a bad cell that are shown
@@ -34,7 +34,7 @@ class Rows:
     """A block of rows: `numbers` (B, k) and `texts`, each of length B, in the order of the selection."""
 
     start: int
-    numbers: NDArray[np.float64]
+    numbers: Float
     texts: tuple[Sequence[str], ...] = ()
 
 

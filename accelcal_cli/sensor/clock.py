@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.cells import Rows, shorten
-
-Floats = NDArray[np.float64]
+from accelcal_cli.streams import Float
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of a time column, in seconds."""
@@ -48,7 +47,7 @@ class Clock:
         return None if self.rate is None else 1.0 / (self.rate * UNITS[self.unit])
 
     @classmethod
-    def of(cls, time: Floats, unit: str | None = None) -> Self:
+    def of(cls, time: Float, unit: str | None = None) -> Self:
         """Tell the rate from the first rows, shape (n,), and the unit where it is not stated.
 
         Without a unit a step of exactly 1 counts rows and says nothing of time. A stated unit that makes the log

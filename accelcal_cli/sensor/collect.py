@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.cells import Rows
@@ -13,27 +12,24 @@ from accelcal_cli.sensor.columns import Columns
 from accelcal_cli.sensor.doubts import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.sensor.repeats import LabelledMeans
 from accelcal_cli.sensor.spool import IN_MEMORY, RowStore
+from accelcal_cli.streams import Float
 
-Floats = NDArray[np.float64]
 STUCK = 1_000_000  # equal readings in a row after which an input is not read on
 
 
 @dataclass
 class Extent:
-    """Least, greatest and mean output of each axis (3,), sensor units, of the rows so far."""
+    """Least and greatest output of each axis (3,), sensor units, of the rows so far."""
 
     rows: int = 0
-    lower: Floats = field(default_factory=lambda: np.full(3, np.inf))
-    upper: Floats = field(default_factory=lambda: np.full(3, -np.inf))
-    mean: Floats = field(default_factory=lambda: np.zeros(3))
+    lower: Float = field(default_factory=lambda: np.full(3, np.inf))
+    upper: Float = field(default_factory=lambda: np.full(3, -np.inf))
 
-    def add(self, output: Floats) -> None:
+    def add(self, output: Float) -> None:
         """Add rows (B, 3)."""
         self.rows += len(output)
         self.lower = np.minimum(self.lower, [axis.min() for axis in output.T])
         self.upper = np.maximum(self.upper, [axis.max() for axis in output.T])
-        step = np.array([axis.mean() for axis in output.T]) - self.mean
-        self.mean = self.mean + step * (len(output) / self.rows)
 
     @property
     def stuck(self) -> bool:
@@ -46,10 +42,10 @@ class Extras:
     """What is known of each pose beside its output; see `Readings` for shapes and units."""
 
     labels: tuple[str, ...] | None = None
-    count: Floats | None = None
-    scatter: Floats | None = None
-    reference: Floats | None = None
-    temperature: Floats | None = None
+    count: Float | None = None
+    scatter: Float | None = None
+    reference: Float | None = None
+    temperature: Float | None = None
 
 
 class Collector:
@@ -63,7 +59,7 @@ class Collector:
         self.store = RowStore()
         self.extent = Extent()
         self._means = None if columns.label is None else LabelledMeans[str](source, 3 + _others(columns))
-        self._extras: list[Floats] | None = [] if columns.extras else None
+        self._extras: list[Float] | None = [] if columns.extras else None
 
     def add(self, rows: Rows) -> None:
         """Take in one block."""
@@ -107,14 +103,14 @@ class Collector:
     def _value(self) -> str:
         return "(" + ", ".join(f"{value:g}" for value in self.extent.lower) + ")"
 
-    def _split(self, extras: Floats) -> tuple[Floats | None, Floats | None, Floats]:
+    def _split(self, extras: Float) -> tuple[Float | None, Float | None, Float]:
         """Part the extra columns (B, k) into count (B,), scatter (B, 3) and the others (B, m)."""
         at = 0 if self.columns.count is None else 1
         then = at + (0 if self.columns.scatter is None else 3)
         count = extras[:, 0] if at else None
         return count, extras[:, at:then] if then > at else None, extras[:, then:]
 
-    def _keep_extras(self, extras: Floats) -> None:
+    def _keep_extras(self, extras: Float) -> None:
         if self._extras is None:
             return
         self._extras.append(extras.copy())
@@ -142,7 +138,7 @@ class Collector:
         reference, temperature = self._others(means.mean[:, 3:])
         return Extras(tuple(means.index), means.count(), means.scatter(), reference, temperature)
 
-    def _others(self, others: Floats) -> tuple[Floats | None, Floats | None]:
+    def _others(self, others: Float) -> tuple[Float | None, Float | None]:
         """Part the other columns (J, m) into reference (J, 3) and temperature (J,)."""
         reference = None if self.columns.reference is None else others[:, :3]
         temperature = None if self.columns.temperature is None else others[:, -1]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from accelcal_cli.streams import Float
 
 MOST = 4096
 """Bins kept at most: more than a picture has columns of dots; then two become one."""
@@ -22,11 +21,12 @@ class Envelope:
         """Start without rows; a tile has `size` rows."""
         self.size = size
         self.per_bin = 1
-        self._low, self._high = np.empty((0, 3)), np.empty((0, 3))
-        self._time = np.empty(0)
-        self._open: list[tuple[Floats, Floats, float]] = []  # tiles that do not fill a bin yet
+        self._low: Float = np.empty((0, 3))
+        self._high: Float = np.empty((0, 3))
+        self._time: Float = np.empty(0)
+        self._open: list[tuple[Float, Float, float]] = []  # tiles that do not fill a bin yet
 
-    def add(self, tiles: Floats, time: Floats | None) -> None:
+    def add(self, tiles: Float, time: Float | None) -> None:
         """Take in tiles, shape (3, m, size), and the time of each of their rows, shape (m size,)."""
         low, high = tiles.min(axis=2).T, tiles.max(axis=2).T
         start = np.full(len(low), np.nan) if time is None else time[:: self.size]
@@ -54,7 +54,7 @@ class Envelope:
         self._time = self._time[:whole:2]
         self.per_bin *= 2
 
-    def bins(self) -> tuple[Floats, Floats, Floats]:
+    def bins(self) -> tuple[Float, Float, Float]:
         """Return first row (b,) or time (b,) where there is time, least and greatest output (b, 3) of each bin."""
         low, high, time = self._low, self._high, self._time
         if self._open:
@@ -69,6 +69,6 @@ class Envelope:
         return rows, low, high
 
 
-def _fold(values: Floats, by: int, join: np.ufunc) -> Floats:
-    folded: Floats = join.reduce(values.reshape(-1, by, 3), axis=1)
+def _fold(values: Float, by: int, join: np.ufunc) -> Float:
+    folded: Float = join.reduce(values.reshape(-1, by, 3), axis=1)
     return folded

@@ -13,7 +13,7 @@ from accelcal_cli.sensor.cells import Rows
 from accelcal_cli.sensor.columns import Columns, choose, sensor_column, sensor_columns
 from accelcal_cli.sensor.fleet import FleetReadings, Origin
 from accelcal_cli.sensor.readings import check_rows
-from accelcal_cli.sensor.repeats import Floats, LabelledMeans
+from accelcal_cli.sensor.repeats import LabelledMeans
 from accelcal_cli.sensor.spool import RowStore
 from accelcal_cli.sensor.tabular import Table, open_table
 from accelcal_cli.streams import Float, Int
@@ -168,7 +168,7 @@ def _by_label(labels: list[str]) -> Callable[[int], str]:
     return lambda pose: f'position "{labels[pose]}"'
 
 
-def _extras(columns: Columns, rows: Rows) -> tuple[Floats | None, Floats | None]:
+def _extras(columns: Columns, rows: Rows) -> tuple[Float | None, Float | None]:
     """Return count (B,) and standard deviation (B, 3) of the rows, where the table has them."""
     at = 3 if columns.count is None else 4
     count = None if columns.count is None else rows.numbers[:, 3]

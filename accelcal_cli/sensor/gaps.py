@@ -9,13 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.sensor.clock import UNITS, Clock
 from accelcal_cli.sensor.spans import Rows
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from accelcal_cli.streams import Bool, Float
 
 LATE = 10
 """Periods that a row may come late, however short the window: a logger pauses when it writes to its card."""
@@ -36,7 +33,7 @@ class Limit:
         """Return the limit of a log: a window, and LATE periods at least."""
         return cls() if clock.period is None else cls(max(rows.window, LATE) * clock.period)
 
-    def late(self, start: Floats, end: Floats, before: float) -> tuple[Bools, Bools]:
+    def late(self, start: Float, end: Float, before: float) -> tuple[Bool, Bool]:
         """Return whether there is a gap before and within each tile, shape (B,) each.
 
         Several within a tile, a tenth of a window, are one: what counts is that the tile lasts too long.
@@ -47,11 +44,11 @@ class Limit:
         """
         return start - np.append(before, end[:-1]) > self.longest, end - start > self.longest
 
-    def spanned(self, start: Floats, end: Floats, width: int) -> Bools:
+    def spanned(self, start: Float, end: Float, width: int) -> Bool:
         """Return which windows of `width` tiles have a gap in them, shape (B - width + 1,)."""
         before, within = self.late(start, end, start[0])
         count = np.append(0, np.cumsum(before.astype(np.int64) + within))
-        found: Bools = count[width:] - count[:-width] > before[: len(start) - width + 1]
+        found: Bool = count[width:] - count[:-width] > before[: len(start) - width + 1]
         return found
 
 
@@ -68,7 +65,7 @@ class Gaps:
         self.count, self.largest, self.after = 0, 0.0, 0.0
         self._last: float | None = None
 
-    def see(self, time: Floats) -> None:
+    def see(self, time: Float) -> None:
         """Take in the times of the next tiles, shape (B, rows of a tile)."""
         start, end = time[:, 0], time[:, -1]
         last = float(start[0]) if self._last is None else self._last
@@ -80,7 +77,7 @@ class Gaps:
         if within.any():
             self._count(np.diff(time[within], axis=1).max(axis=1), start[within])
 
-    def _count(self, steps: Floats, after: Floats) -> None:
+    def _count(self, steps: Float, after: Float) -> None:
         """Count gaps, each with its step and the time before it, shape (k,)."""
         k = int(np.argmax(steps))
         self.count += len(steps)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from accelcal_cli.sensor.spans import Rows
 from accelcal_cli.sensor.static import Level, runs
 from accelcal_cli.sensor.tiles import Tiles
+from accelcal_cli.streams import Float
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Moments = tuple[Floats, Floats, Floats]
+Moments = tuple[Float, Float, Float]
 
 STEADY = 0.04
 """Halves of a pose have means that differ by less than this part of half the range of the readings, about 1 g: 2.3
@@ -39,9 +39,9 @@ class Intervals:
     start: Ints
     end: Ints
     n: Ints
-    mean: Floats
-    scatter: Floats
-    time: Floats | None = None
+    mean: Float
+    scatter: Float
+    time: Float | None = None
 
     def __len__(self) -> int:
         """I."""
@@ -126,7 +126,7 @@ class Atoms:
     tile: int
     edge: Ints
     moments: Moments
-    time: Floats | None
+    time: Float | None
 
     @classmethod
     def of(cls, tiles: Tiles, edge: Ints) -> Self:
@@ -183,8 +183,8 @@ def _together(items: Moments, low: Ints, high: Ints) -> Moments:
     rows, square = items[0][inside], items[2][inside]
     centre = items[1][low]  # about an item of the interval itself the sums stay small
     off = items[1][inside] - centre[owner]
-    total: Floats = np.add.reduceat(rows, begin)
-    shift: Floats = np.add.reduceat(rows[:, None] * off, begin) / total[:, None]
+    total: Float = np.add.reduceat(rows, begin)
+    shift: Float = np.add.reduceat(rows[:, None] * off, begin) / total[:, None]
     off -= shift[owner]
     return total, centre + shift, np.add.reduceat(square + rows[:, None] * off * off, begin)
 

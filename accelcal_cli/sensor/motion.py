@@ -10,10 +10,7 @@ import numpy as np
 
 from accelcal_cli.registry import check, setting
 from accelcal_cli.sensor.simulation import Sensor
-from accelcal_cli.streams import Float, Streams
-
-RAW_PURPOSE = 4
-"""Stream of a raw log: one run for each hold and each move."""
+from accelcal_cli.streams import Float, Purpose, Streams
 
 HOLD_SPREAD = 0.2
 """Holds last up to this part longer or shorter than stated."""
@@ -75,7 +72,7 @@ def handled(
     """
     row = 0
     for k in range(2 * len(u) - 1):
-        streams = Streams(seed, [k], purpose=RAW_PURPOSE)
+        streams = Streams(seed, [k], Purpose.RAW_LOG)
         lottery = streams.uniform(1, 8)[0, 0]
         at, still = k // 2, k % 2 == 0
         seconds = handling.hold * (1 + HOLD_SPREAD * (2 * lottery[0] - 1)) if still else handling.move

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.cells import Rows
 from accelcal_cli.sensor.clock import Clock, dated, unit_of
 from accelcal_cli.sensor.rawcolumns import RawColumns, choose_raw
 from accelcal_cli.sensor.tabular import Table, open_table
-
-Floats = NDArray[np.float64]
+from accelcal_cli.streams import Float
 
 PROBE = 1000
 """Rows that tell the step of the time column, and whether a column without a name is one."""
@@ -31,12 +29,12 @@ class RawRows:
         gyro, timed: which of them there are.
     """
 
-    numbers: Floats
+    numbers: Float
     gyro: bool = False
     timed: bool = False
 
     @property
-    def time(self) -> Floats | None:
+    def time(self) -> Float | None:
         """Time of each row, shape (B,), as given."""
         return self.numbers[:, -1] if self.timed else None
 
@@ -119,12 +117,12 @@ class RawLog:
         """Release the file."""
         self._table.close()
 
-    def _part(self, numbers: Floats) -> RawRows:
+    def _part(self, numbers: Float) -> RawRows:
         sensors = 6 if self.columns.gyro else 3
         timed = self.columns.time is not None
         return RawRows(numbers[:, : sensors + timed], sensors == 6, timed)
 
-    def _check_time(self, time: Floats, last: float, start: int) -> None:
+    def _check_time(self, time: Float, last: float, start: int) -> None:
         back = np.diff(time, prepend=last) < 0
         if not back.any():
             return
@@ -172,5 +170,5 @@ def _first(rows: Iterator[Rows], least: int) -> list[Rows]:
     return taken
 
 
-def _column(blocks: list[Rows], k: int) -> Floats:
+def _column(blocks: list[Rows], k: int) -> Float:
     return np.concatenate([np.empty(0), *(block.numbers[:, k] for block in blocks)])

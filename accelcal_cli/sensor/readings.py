@@ -17,8 +17,7 @@ from accelcal_cli.sensor.collect import Collector, Extras
 from accelcal_cli.sensor.columns import Columns, choose
 from accelcal_cli.sensor.spool import RowStore
 from accelcal_cli.sensor.tabular import Table, open_table
-
-Floats = NDArray[np.float64]
+from accelcal_cli.streams import Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,26 +28,23 @@ class Readings:
     sha256: str  # of the input bytes
     columns: tuple[str, str, str]  # names (or numbers) of the output columns
     poses: int  # J
-    lower: Floats  # (3,) least output of each axis, sensor units
-    upper: Floats  # (3,) greatest output of each axis, sensor units
-    mean: Floats  # (3,) mean output of each axis, sensor units
+    lower: Float  # (3,) least output of each axis, sensor units
+    upper: Float  # (3,) greatest output of each axis, sensor units
     labels: tuple[str, ...] | None = None
-    count: Floats | None = None  # (J,) raw readings behind each pose
-    scatter: Floats | None = (
-        None  # (J, 3) standard deviation of one raw reading, sensor units, nan if unknown
-    )
-    reference: Floats | None = None  # (J, 3) known specific force, m/s^2 or g as given
-    temperature: Floats | None = None  # (J,) as given, nan where missing
+    count: Float | None = None  # (J,) raw readings behind each pose
+    scatter: Float | None = None  # (J, 3) standard deviation of one raw reading, sensor units, nan if unknown
+    reference: Float | None = None  # (J, 3) known specific force, m/s^2 or g as given
+    temperature: Float | None = None  # (J,) as given, nan where missing
     notes: tuple[str, ...] = ()  # what the reader did that a user should know
     cautions: tuple[str, ...] = ()  # why the readings may not be what they are taken for
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 
-    def blocks(self, rows: int = 65536) -> Iterator[tuple[int, Floats]]:
+    def blocks(self, rows: int = 65536) -> Iterator[tuple[int, Float]]:
         """Yield (first pose, output (B, 3) in sensor units), in constant memory, as often as asked."""
         return self._store.blocks(rows)
 
-    def output(self) -> Floats:
+    def output(self) -> Float:
         """Return the output of every pose, (J, 3), sensor units."""
         return self._store.all()
 
@@ -110,7 +106,6 @@ class Readings:
             poses=collector.store.rows,
             lower=extent.lower,
             upper=extent.upper,
-            mean=extent.mean,
             labels=extras.labels,
             count=extras.count,
             scatter=extras.scatter,
@@ -171,7 +166,7 @@ def _distinct(labels: Sequence[str], poses: int) -> tuple[str, ...]:
     return names
 
 
-def _counts(count: Floats) -> Floats:
+def _counts(count: Float) -> Float:
     if ((count < 1) | (count != np.round(count))).any():
         raise DataError("count: whole numbers of 1 or more were expected")
     return count
@@ -179,7 +174,7 @@ def _counts(count: Floats) -> Floats:
 
 def _shaped(
     what: str, values: ArrayLike, width: int, rows: int | None = None, *, gaps: bool = False
-) -> Floats:
+) -> Float:
     """Copy of an array, checked: (rows, width), or (rows,) where width is 1, finite, of sane size."""
     array = np.array(values, dtype=np.float64)
     shaped = array.reshape(-1, 1) if width == 1 and array.ndim == 1 else array

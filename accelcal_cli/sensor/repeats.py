@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.streams import Float
 
 MOST_LABELS = 1_000_000
-Floats = NDArray[np.float64]
 Label = TypeVar("Label", bound=Hashable)
 
 
@@ -38,9 +38,9 @@ class LabelledMeans(Generic[Label]):
     def add(
         self,
         labels: Sequence[Label],
-        rows: Floats,
-        weight: Floats | None = None,
-        spread: Floats | None = None,
+        rows: Float,
+        weight: Float | None = None,
+        spread: Float | None = None,
     ) -> None:
         """Add rows (B, width), with weights (B,) and standard deviations (B, 3) in sensor units if known."""
         index = self.index
@@ -55,7 +55,7 @@ class LabelledMeans(Generic[Label]):
             inner = np.where(weight[:, None] > 1, spread**2 * (weight[:, None] - 1), 0.0)
             np.add.at(self.square, codes, inner)
 
-    def _merge(self, codes: NDArray[np.intp], rows: Floats, weight: Floats) -> None:
+    def _merge(self, codes: NDArray[np.intp], rows: Float, weight: Float) -> None:
         origin = rows[0]  # sums of differences keep the digits that a large offset would eat
         shifted = rows - origin
         fresh = _sums(codes, weight, len(self.weight))
@@ -89,11 +89,11 @@ class LabelledMeans(Generic[Label]):
         """Whether any label came more than once."""
         return bool((self.rows > 1).any())
 
-    def count(self) -> Floats | None:
+    def count(self) -> Float | None:
         """Raw readings of each label (J,); None where rows are single or means of an unknown number."""
         return self.weight if self.weighted or (self.repeated and not self.spreads) else None
 
-    def scatter(self) -> Floats | None:
+    def scatter(self) -> Float | None:
         """Standard deviation of a single raw reading (J, 3) in sensor units; nan where nothing tells it."""
         if not (self.spreads or self.repeated):
             return None
@@ -103,5 +103,5 @@ class LabelledMeans(Generic[Label]):
         return np.where(self.rows[:, None] > 1, pooled, single)
 
 
-def _sums(codes: NDArray[np.intp], values: Floats, size: int) -> Floats:
+def _sums(codes: NDArray[np.intp], values: Float, size: int) -> Float:
     return np.bincount(codes, weights=values, minlength=size).astype(np.float64, copy=False)

@@ -10,9 +10,8 @@ import numpy as np
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.registry import check, setting
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Float, Purpose, Streams
 
-NOISE_PURPOSE, ATTITUDE_PURPOSE, SENSOR_PURPOSE = 2, 3, 5
 """Streams of the noise, of random attitudes and of sensors drawn from their type."""
 
 Row = tuple[float, float, float]
@@ -82,7 +81,7 @@ def draw(sensor: Sensor, runs: Sequence[int], seed: int) -> ErrorModel:
         runs: numbers of the runs; run r draws the same sensor in any company.
         seed: of all draws.
     """
-    z = Streams(seed, runs, purpose=SENSOR_PURPOSE).normal(4, 3)
+    z = Streams(seed, runs, Purpose.SENSOR).normal(4, 3)
     nominal = float(np.trace(np.array(sensor.K_a))) / 3.0
     scale = nominal * (1.0 + sensor.spread.scale * z[:, 0])
     turned = np.broadcast_to(np.eye(3), (len(z), 3, 3)).copy()
@@ -101,7 +100,7 @@ def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, see
         noise: one sigma of one sample and axis, m/s^2.
         seed: of the noise.
     """
-    return _readings(sensor.model, u, g, samples, noise, Streams(seed, [0], purpose=NOISE_PURPOSE))
+    return _readings(sensor.model, u, g, samples, noise, Streams(seed, [0], Purpose.NOISE))
 
 
 def simulate_fleet(
@@ -111,7 +110,7 @@ def simulate_fleet(
     drawn = draw(sensor, range(sensors), seed)
     for run in range(sensors):
         model = ErrorModel(drawn.K[run], drawn.D[run])
-        yield model, _readings(model, u, g, samples, noise, Streams(seed, [run], purpose=NOISE_PURPOSE))
+        yield model, _readings(model, u, g, samples, noise, Streams(seed, [run], Purpose.NOISE))
 
 
 def _readings(

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.beside import Beside
+from accelcal_cli.streams import Float
 
 IN_MEMORY = 1_000_000  # rows
 
@@ -29,11 +29,11 @@ class RowStore:
         self.rows = 0
         self.width = width
         self._limit = limit
-        self._parts: list[NDArray[np.float64]] = []
+        self._parts: list[Float] = []
         self._file: BinaryIO | None = None
         self._writing = Beside()
 
-    def append(self, rows: NDArray[np.float64]) -> None:
+    def append(self, rows: Float) -> None:
         """Add rows (B, width)."""
         if not len(rows):
             return
@@ -44,7 +44,7 @@ class RowStore:
             with _named_disk_errors():
                 self._writing.start(lambda: self._spill(parts))
 
-    def blocks(self, rows: int = 65536) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    def blocks(self, rows: int = 65536) -> Iterator[tuple[int, Float]]:
         """Yield (first row, block) with blocks of up to `rows` rows; blocks are read-only or private."""
         self._settle()
         if self._file is None:
@@ -60,14 +60,14 @@ class RowStore:
                 self._fill(block)
             yield start, block
 
-    def all(self) -> NDArray[np.float64]:
+    def all(self) -> Float:
         """Every row, (rows, width)."""
         self._settle()
         if self._file is None:
             return self._in_memory()
         return np.concatenate([block for _, block in self.blocks()])
 
-    def _in_memory(self) -> NDArray[np.float64]:
+    def _in_memory(self) -> Float:
         if len(self._parts) != 1:
             self._parts = [np.concatenate([np.empty((0, self.width)), *self._parts])]
         self._parts[0].flags.writeable = False
@@ -77,7 +77,7 @@ class RowStore:
         with _named_disk_errors():
             self._writing.wait()
 
-    def _spill(self, parts: list[NDArray[np.float64]]) -> None:
+    def _spill(self, parts: list[Float]) -> None:
         if self._file is None:
             import tempfile  # costs as much as reading a small table
 
@@ -89,7 +89,7 @@ class RowStore:
             while view:  # an unbuffered write may take less than all
                 view = view[self._file.write(view) :]
 
-    def _fill(self, block: NDArray[np.float64]) -> None:
+    def _fill(self, block: Float) -> None:
         view = block.data.cast("B")
         while view:
             got = self._file.readinto(view) if self._file is not None else 0  # type: ignore[attr-defined]

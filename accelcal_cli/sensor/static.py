@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.spans import Rows
 from accelcal_cli.sensor.tiles import Tiles
+from accelcal_cli.streams import Float
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SAMPLE = 100_000
@@ -56,7 +56,7 @@ class Level:
     quietest: float
     extent: float
     turning: float
-    bias: Floats
+    bias: Float
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,15 @@ class Windows:
     """
 
     first: int
-    mean: Floats
-    variance: Floats
-    rate: Floats
-    spread: Floats
+    mean: Float
+    variance: Float
+    rate: Float
+    spread: Float
     broken: NDArray[np.bool_]
 
-    def turning(self, bias: Floats) -> Floats:
+    def turning(self, bias: Float) -> Float:
         """Return the mean square of the turning rate about its bias, shape (B,)."""
-        turning: Floats = self.spread + ((self.rate - bias) ** 2).sum(axis=1)
+        turning: Float = self.spread + ((self.rate - bias) ** 2).sum(axis=1)
         return turning
 
 
@@ -102,10 +102,10 @@ def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
         yield Windows(first + start, mean.T, norm, rate.T, spread, broken)
 
 
-def _window(moments: Floats, size: int, width: int, take: slice) -> tuple[Floats, Floats]:
+def _window(moments: Float, size: int, width: int, take: slice) -> tuple[Float, Float]:
     """Return mean and variance, each (3, windows), of the windows of `width` tiles that begin at `take`."""
     parts = [moments[take.start + k : take.stop + k : take.step].T.copy() for k in range(width)]
-    centre: Floats = np.add.reduce([part[:3] for part in parts]) / width
+    centre: Float = np.add.reduce([part[:3] for part in parts]) / width
     square = np.zeros_like(centre)
     for part in parts:
         off = part[:3] - centre
@@ -140,16 +140,15 @@ def find_level(tiles: Tiles, rows: Rows, name: str) -> Level:
     quietest = float(np.quantile(variance[noisy], part))
     level = quietest if rows.still is None else _still_period(tiles, rows, quietest, name)
     extent = 0.5 * float(np.ptp(np.quantile(mean, [0.01, 0.99], axis=0), axis=0).max())
-    turning, bias = np.inf, np.zeros(3)
-    if tiles.gyro:
-        turning, bias = _turning(sample, variance <= ACCELEROMETER_QUIET * quietest)
-    return Level(level, quietest, extent, turning, bias)
+    if not tiles.gyro:
+        return Level(level, quietest, extent, np.inf, np.zeros(3))
+    return Level(level, quietest, extent, *_turning(sample, variance <= ACCELEROMETER_QUIET * quietest))
 
 
-def _turning(sample: Sequence[Windows], calm: NDArray[np.bool_]) -> tuple[float, Floats]:
+def _turning(sample: Sequence[Windows], calm: NDArray[np.bool_]) -> tuple[float, Float]:
     """Return the level of the gyroscope and its bias, from the windows that the accelerometer calls calm."""
     rate = np.concatenate([w.rate for w in sample])[calm]
-    bias: Floats = np.median(rate, axis=0)
+    bias: Float = np.median(rate, axis=0)
     square = np.concatenate([w.turning(bias) for w in sample])[calm]
     return float(np.quantile(square, MOST_TURNING)), bias
 

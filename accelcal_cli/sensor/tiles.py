@@ -10,15 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.sensor.envelope import Envelope
 from accelcal_cli.sensor.gaps import Gaps, Limit
 from accelcal_cli.sensor.rawlog import RawLog, RawRows
 from accelcal_cli.sensor.spans import Rows
 from accelcal_cli.sensor.spool import RowStore
-
-Floats = NDArray[np.float64]
+from accelcal_cli.streams import Float
 
 NO_GAP = Limit()
 
@@ -45,7 +43,7 @@ class Tiles:
         self.gaps = Gaps(limit)
         self.rows = 0
         self._store = RowStore(6 + 6 * gyro + 2 * timed, IN_MEMORY)
-        self._rest: Floats | None = None
+        self._rest: Float | None = None
 
     @property
     def count(self) -> int:
@@ -67,7 +65,7 @@ class Tiles:
         self._reduce(block[:, :whole], envelope)
         self._rest = block[:, whole:].copy()
 
-    def _reduce(self, block: Floats, envelope: Envelope | None) -> None:
+    def _reduce(self, block: Float, envelope: Envelope | None) -> None:
         """Store the tiles of a block of whole tiles, shape (k, m size)."""
         tiles = block.shape[1] // self.size
         if not tiles:
@@ -89,9 +87,9 @@ class Tiles:
         if envelope is not None:
             envelope.add(block[:3].reshape(3, tiles, self.size), block[-1] if self.timed else None)
 
-    def blocks(self, overlap: int = 0) -> Iterator[tuple[int, Floats]]:
+    def blocks(self, overlap: int = 0) -> Iterator[tuple[int, Float]]:
         """Yield (first tile, block (B, width)); each block begins with the last `overlap` tiles of the one before."""
-        tail: Floats | None = None
+        tail: Float | None = None
         for first, block in self._store.blocks(BLOCK):
             joined = block if tail is None else np.concatenate([tail, block])
             yield first - (0 if tail is None else len(tail)), joined

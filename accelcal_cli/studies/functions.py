@@ -13,10 +13,9 @@ import numpy as np
 
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.problem import Problem
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.streams import Float, Purpose, Streams
 from accelcal_cli.studies import formulas, squares
 
-SHIFT_PURPOSE = 4
 MARGIN = 0.1
 """A moved optimum keeps this part of the half box from the walls."""
 
@@ -101,7 +100,7 @@ class TestFunction(Problem):
         if definition.start:
             low, high = definition.start
             self.start = np.full(dimensions, low), np.full(dimensions, high)
-        stream = Streams(seed, [0], purpose=SHIFT_PURPOSE)
+        stream = Streams(seed, [0], Purpose.SHIFT)
         centre, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
         place = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions)[0, 0] - 1.0)
         self.optimum = place if shift else np.full(dimensions, definition.optimum)

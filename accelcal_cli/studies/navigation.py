@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.filters import FILTER_PURPOSE, Track
+from accelcal_cli.navigation.filters import Track
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.navigation.scores import Scores, score
-from accelcal_cli.streams import Streams
+from accelcal_cli.streams import Purpose, Streams
 from accelcal_cli.studies.study import Record, Study, Task
 from accelcal_cli.studies.voyage_curves import curve_of
 from accelcal_cli.studies.voyages import FilterEntry, Waters
@@ -70,7 +70,7 @@ class Navigation(Study):
         scenario = self.waters.scenario(grade, runs, self.seed)
         begin = time.perf_counter()
         with np.errstate(all="ignore"):  # a diverging filter overflows; its score says so
-            track = entry.build().run(scenario, Streams(self.seed, runs, FILTER_PURPOSE))
+            track = entry.build().run(scenario, Streams(self.seed, runs, Purpose.FILTER))
             scores = score(scenario, track)
         seconds = (time.perf_counter() - begin) / len(runs)
         return [_record(task, i, scenario, track, scores, seconds) for i in range(len(runs))]

@@ -32,7 +32,8 @@ Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
 
 def names() -> list[str]:
     """Return the experiments on optimizers by name."""
-    return [name for name in shipped(STUDY_KIND) if name not in voyages()]
+    others = voyages()
+    return [name for name in shipped(STUDY_KIND) if name not in others]
 
 
 def voyages() -> list[str]:

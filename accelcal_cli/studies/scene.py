@@ -14,7 +14,7 @@ import numpy as np
 from accelcal_cli.calibration.compress import Triangle, compress_each
 from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
 from accelcal_cli.calibration.lotters import Box, Loetters, pack
-from accelcal_cli.calibration.nominal import BOX_PURPOSE, SHIFT, half_widths
+from accelcal_cli.calibration.nominal import SHIFT, half_widths
 from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.quality import information
 from accelcal_cli.calibration.search import polish
@@ -24,10 +24,9 @@ from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 from accelcal_cli.sensor.poses import directions
 from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.sensor.simulation import ATTITUDE_PURPOSE, NOISE_PURPOSE, Sensor, draw
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.sensor.simulation import Sensor, draw
+from accelcal_cli.streams import Float, Purpose, Streams
 
-START_PURPOSE = 6
 """Stream of starting points outside the box."""
 
 FEWEST = 9
@@ -140,10 +139,10 @@ def simulated(source: Simulation, space: Search, runs: Sequence[int], seed: int)
     sensor = draw(source.sensor, runs, seed) if source.drawn else source.sensor.model
     K = np.broadcast_to(sensor.K, (len(runs), 3, 3))
     D = np.broadcast_to(sensor.D, (len(runs), 3))
-    random = Streams(seed, [0], purpose=ATTITUDE_PURPOSE).normal(source.positions, 3)[0]
+    random = Streams(seed, [0], Purpose.ATTITUDE).normal(source.positions, 3)[0]
     force = space.g * directions(source.positions, source.scheme, random)
     clean = force @ K.swapaxes(1, 2) + D[:, None]
-    noise = source.noise * Streams(seed, runs, purpose=NOISE_PURPOSE).normal(source.positions, 3)
+    noise = source.noise * Streams(seed, runs, Purpose.NOISE).normal(source.positions, 3)
     triangle = compress_each(clean + noise @ K.swapaxes(1, 2))
     problem = Loetters(triangle, space.g, _box(triangle, space, runs, seed))
     least = polish(problem, np.clip(problem.coordinates(K, D), -1.0, 1.0)).cost
@@ -178,7 +177,7 @@ def starting_points(
     scale = np.broadcast_to(space.nominal or box.centre[:, :3].mean(axis=1, keepdims=True), (len(runs), 3))
     centre = pack(scale[..., None] * np.eye(3), np.zeros((len(runs), 3)), space.unknowns)
     half = half_widths(scale, space.start, space.g, space.unknowns)
-    u = 2.0 * Streams(seed, runs, purpose=START_PURPOSE).uniform(population, space.unknowns) - 1.0
+    u = 2.0 * Streams(seed, runs, Purpose.START).uniform(population, space.unknowns) - 1.0
     return (centre[:, None] + half[:, None] * u - box.centre[:, None]) / box.half[:, None]
 
 
@@ -198,7 +197,7 @@ def _box(triangle: Triangle, space: Search, runs: Sequence[int], seed: int) -> B
     if space.unknowns == 12:  # of the valley, the point closest to no rotation
         K = to_gauge(K, "symmetric")
     half = half_widths(np.einsum("rii->ri", K), space.box, space.g, space.unknowns)
-    u = Streams(seed, runs, purpose=BOX_PURPOSE).uniform(1, space.unknowns)[:, 0]
+    u = Streams(seed, runs, Purpose.BOX).uniform(1, space.unknowns)[:, 0]
     return Box(pack(K, D, space.unknowns) + SHIFT * (2.0 * u - 1.0) * half, half)
 
 

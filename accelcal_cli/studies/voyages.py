@@ -24,6 +24,7 @@ from accelcal_cli.navigation.scenario import Scenario, simulate
 from accelcal_cli.navigation.voyage import Plan, planned
 from accelcal_cli.navigation.voyage_file import read_voyage, recorded
 from accelcal_cli.registry import build, check, setting
+from accelcal_cli.sensor.units import STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
     """
     sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(calibration.K_a))
     if calibration.unit == "g":
-        sigma = sigma * 9.80665
+        sigma = sigma * STANDARD_GRAVITY
     value = float(np.sqrt(np.mean(np.square(sigma)))) / MICRO_G
     if not math.isfinite(value) or value <= 0:
         raise DataError(f"{where}: the calibration does not determine the biases ({calibration.verdict})")

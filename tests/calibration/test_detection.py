@@ -10,7 +10,7 @@ from raw_logs import G, opened, simulated, text
 from simulated import MEMS, noise
 
 from accelcal_cli.calibration.attitudes import attitudes
-from accelcal_cli.calibration.candidates import TIE
+from accelcal_cli.calibration.candidates import TIE, Candidate, best
 from accelcal_cli.calibration.detection import MULTIPLIERS, DetectSettings, detect
 from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.settings import Settings
@@ -261,3 +261,24 @@ def test_auto_weights_come_near_the_better_of_the_others(shared):
         return float(np.mean(np.square(found)))
 
     assert error("auto") < 2.0 * min(error("none"), error("n"))
+
+
+def test_of_candidates_as_good_the_stillest_is_kept():
+    found = [Candidate(m, 20, 20, 0.01, sigma, "good") for m, sigma in ((5.0, 1.0), (3.0, 1.04), (2.0, 1.06))]
+    assert best([0, 1, 2], found) == 1
+    assert best([0, 2], found) == 0
+
+
+def test_a_pose_of_many_readings_is_not_taken_for_free_of_error():
+    """Scatter that explains the errors alone: the weights are 1 / (v_j / n_j and a hundredth of its mean)."""
+    u, scatter = fibonacci(24), 0.1
+    count = np.array([10.0, 1e6] * 12)
+    plain = ErrorModel(np.eye(3), np.zeros(3))
+    data = Readings.from_array(
+        plain.output(G * u + noise(24, 1e-4, 1)), count=count, scatter=np.full((24, 3), scatter)
+    )
+    own = [scatter**2 / n for n in count]
+    expected = np.array([1.0 / (v + 0.01 * sum(own) / 24) for v in own])
+    weights = shared_weights(data, Settings(g=G, weights="auto"))
+    np.testing.assert_allclose(weights, expected / expected.mean(), rtol=1e-3)
+    assert weights.max() / weights.min() < 250

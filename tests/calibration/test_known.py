@@ -6,9 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.stats
 from simulated import MEMS, noise
 
 from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
@@ -124,3 +126,47 @@ def test_a_reference_is_not_used_unasked():
     result = calibrate(known(poses.turns()), Settings(g=G, optimizer="levenberg-marquardt"))
     assert result.gauge == "lower"
     assert any("--attitudes known" in note for note in result.notes)
+
+
+def _beyond_chance(data):
+    """The poses whose leaving out takes more off the squares than chance allows: fits with numpy, pose by pose."""
+    F = np.column_stack([data.reference, np.ones(len(data.reference))])
+    N, J = data.output(), len(data.reference)
+    K_A = np.linalg.inv(np.linalg.lstsq(F, N)[0][:3].T)
+
+    def square(keep):
+        rest = N[keep] - F[keep] @ np.linalg.lstsq(F[keep], N[keep])[0]
+        return np.sum((rest @ K_A.T) ** 2)
+
+    every, named = square(np.arange(J)), []
+    for j in range(J):
+        others = square(np.delete(np.arange(J), j))
+        ratio = (every - others) / 3 / (others / (3 * J - 15))
+        if J * scipy.stats.f.sf(ratio, 3, 3 * J - 15) < OUTLIER_LEVEL:
+            named.append(j)
+    return tuple(named)
+
+
+@pytest.mark.parametrize("wrong", [2, 9])
+def test_outliers_are_those_whose_leaving_out_tells(wrong):
+    """One pose of twelve off by nothing to twelve sigma: the fit follows a third of it."""
+    found = []
+    for size in np.linspace(0.0, 12.0, 25):
+        force = G * TWELVE + noise(12, SIGMA, 1)
+        force[wrong] += size * SIGMA
+        data = Readings.from_array(MEMS.output(force), reference=G * TWELVE)
+        found.append(calibrate(data, KNOWN).outliers)
+        assert found[-1] == _beyond_chance(data)
+    assert found[0] == ()
+    assert found[-1] == (wrong,)
+
+
+def test_residuals_are_of_the_length_over_the_noise_of_all_poses():
+    data = known()
+    result = calibrate(data, KNOWN)
+    F = np.column_stack([G * TWELVE, np.ones(12)])
+    room = 1.0 - np.diagonal(F @ np.linalg.pinv(F))
+    length = np.linalg.norm(result.model.specific_force(data.output()), axis=1) - G
+    np.testing.assert_allclose([pose.residual for pose in result.poses_fit], length, rtol=1e-9)
+    studentised = [pose.studentised for pose in result.poses_fit]
+    np.testing.assert_allclose(studentised, length / (result.s * np.sqrt(room)), rtol=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -458,3 +459,24 @@ def test_scatter_within_poses_is_compared_with_the_fit():
     assert result.noise_chance < 1e-6
     assert any(f"residuals are {result.noise_ratio:.2g} times" in caution for caution in result.cautions)
     assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).noise_ratio is None
+
+
+def test_searches_that_stop_at_different_costs_do_not_agree():
+    """Five searches cut short: none but the best itself has its cost; polished, all have."""
+    data = readings(poses.turns(), sigma=1e-3)
+    short = Settings(
+        optimizer="pso", g=G, runs=5, parameters={"iterations": 40, "population": 20}, polish=False
+    )
+    assert calibrate(data, short).runs_agreeing == 1
+    assert calibrate(data, dataclasses.replace(short, polish=True)).runs_agreeing == 5
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft-l1"])
+def test_sigma_of_a_robust_fit_is_what_repeated_noise_gives(loss):
+    u, settings = np.concatenate([poses.turns(), poses.fibonacci(24)]), dataclasses.replace(FAST, robust=loss)
+    runs = [calibrate(readings(u, model=MEMS, sigma=1e-3, seed=k), settings) for k in range(100)]
+    stated = np.sqrt(
+        np.mean([np.concatenate([r.sigma.D_a, np.diagonal(r.sigma.K_a)]) ** 2 for r in runs], axis=0)
+    )
+    found = np.std([np.concatenate([r.D_a, np.diagonal(r.K_a)]) for r in runs], axis=0)
+    assert np.mean(found / stated) == pytest.approx(1.0, abs=0.08)

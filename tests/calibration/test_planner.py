@@ -288,3 +288,12 @@ def test_distinct_poses_are_distinct(count):
     assert len(chosen) == len(set(chosen)) == count
     if count == 12:
         assert _dop(allowed[chosen]).max() < 1.05
+
+
+def test_where_the_worst_variance_cannot_fall_the_sum_decides():
+    """z is worst and neither pose turns to it; x is known already, y is not: y, though it comes second."""
+    variance = dict.fromkeys(PARAMETERS, 1e-2)
+    variance.update({"scale factor z": 1.0, "bias z": 1.0, "scale factor y": 0.5, "bias y": 0.5})
+    information = np.diag([1.0 / variance[name] for name in PARAMETERS])
+    assert next_poses(information, np.eye(3)[:2], 1) == [1]
+    assert next_poses(information, np.eye(3)[[1, 0]], 1) == [0]

@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 from simulated import MEMS, noise, readings
 
+from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.result import SCHEMA, Calibration
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.config import dump, load_mapping
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor import poses
@@ -49,6 +52,15 @@ KINDS = ("good", "full", "undetermined", "too few", "labelled, robust, in g")
 @pytest.fixture(scope="module", params=KINDS)
 def result(request):
     return _result(request.param)
+
+
+@pytest.mark.parametrize("cls", [Calibration, PoseFit, Dop, Sigma, Temperature])
+def test_the_docstring_names_every_part_and_no_other(cls):
+    parts = {field.name for field in dataclasses.fields(cls)}
+    text = cls.__doc__.partition("Attributes:")[2]
+    heads = re.findall(r"^ {8}(\w[\w, ]*):", text, re.MULTILINE)
+    assert {name for head in heads for name in head.split(", ")} <= parts
+    assert parts <= set(re.findall(r"\w+", text))
 
 
 def test_a_record_is_plain(result):

@@ -105,3 +105,38 @@ def test_where_the_data_do_not_determine_slopes_the_model_is_plain(data, setting
     result = calibrate(data(), dataclasses.replace(SETTINGS, **settings))
     assert result.temperature is None
     assert any("Temperature column not used" in note and words in note for note in result.notes)
+
+
+def _expected(degrees, u, s):
+    """One-sigma of the twelve numbers K_a and D_a in gauge lower, from all fifteen, differences of |f| alone."""
+    low = np.tril_indices(3)
+    t = (degrees - degrees.mean())[:, None]
+    output = (1 + SCALE * t) * ((G * u) @ LOWER.K.T) + LOWER.D + BIAS * t
+
+    def length(p):
+        K = np.zeros((3, 3))
+        K[low] = p[:6]
+        plain = (output - p[6:9] - p[12:] * t) / (1 + p[9:12] * t)
+        return np.linalg.norm(np.linalg.solve(K, plain.T), axis=0)
+
+    point, steps = np.concatenate([LOWER.K[low], LOWER.D, SCALE, BIAS]), np.full(15, 1e-5)
+    J = np.stack([(length(point + d) - length(point - d)) / 2e-5 for d in np.diag(steps)], axis=1)
+    sigma = s * np.sqrt(np.diagonal(np.linalg.inv(J.T @ J)))
+    K = np.zeros((3, 3))
+    K[low] = sigma[:6]
+    return K, sigma[6:9]
+
+
+def test_the_slopes_take_their_part_of_the_information():
+    """Colder the further z points down: the slopes are hard to tell from scale factor and bias of z.
+
+    The information of the nine is that of the readings at the mean temperature, to a part k t of what they say: where
+    the slopes take nearly all of it, some per cent of what is left.
+    """
+    degrees = 25.0 + 12.0 * U[:, 2] + 3.0 * np.cos(np.arange(48.0))
+    result = calibrate(warm(degrees=degrees, sigma=1e-5), SETTINGS)
+    K, D = _expected(degrees, U, result.s)
+    np.testing.assert_allclose(result.sigma.D_a, D, rtol=0.04)
+    np.testing.assert_allclose(result.sigma.K_a, K, rtol=0.04, atol=1e-9)
+    plain = calibrate(warm(degrees=degrees, sigma=1e-5), dataclasses.replace(SETTINGS, temperature=False))
+    assert D[2] / result.s > 1.5 * plain.sigma.D_a[2] / plain.s

@@ -249,3 +249,18 @@ def test_temperatures_are_brought_to_that_of_the_result():
     found = verify(old, cold)
     assert found.verdict == "changed"
     assert any("no temperatures" in line for line in found.reasons)
+
+
+def test_a_warm_sensor_is_the_one_that_it_was():
+    """Slopes that move a bias by fifteen sigma at 40 degrees, and poses at 40 degrees alone."""
+    u = np.concatenate([TURNS, TURNS])
+    degrees = np.repeat([10.0, 40.0], 24)
+    slopes = 2e-3 * (degrees - 25.0)[:, None] * [1.0, -1.0, 0.5]
+    output = MEMS.output(G * u + noise(48, SIGMA, 1)) + slopes
+    old = calibrate(Readings.from_array(output, temperature=degrees), FAST)
+    later = MEMS.output(G * TURNS + noise(24, SIGMA, 2)) + slopes[24:]
+    assert verify(old, Readings.from_array(later, temperature=degrees[24:])).verdict == "unchanged"
+    shifted = later + np.array([0.0, 0.03, 0.0])
+    found = verify(old, Readings.from_array(shifted, temperature=degrees[24:]))
+    assert found.verdict == "changed"
+    assert found.differences[7].value == pytest.approx(0.03 / LOWER.K[1, 1], rel=0.2)

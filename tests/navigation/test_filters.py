@@ -16,20 +16,20 @@ from accelcal_cli.navigation.de_pf import IDLE
 from accelcal_cli.navigation.differential import Operators, evolve, metropolis
 from accelcal_cli.navigation.error_model import Grade
 from accelcal_cli.navigation.field import PRESETS, generate
-from accelcal_cli.navigation.filters import FILTER_PURPOSE, FILTERS
+from accelcal_cli.navigation.filters import FILTERS
 from accelcal_cli.navigation.gravity_map import GravityMap
 from accelcal_cli.navigation.resampling import SCHEMES, effective_size, normalised
 from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import counted, score
 from accelcal_cli.navigation.voyage import Plan
-from accelcal_cli.streams import Streams
+from accelcal_cli.streams import Purpose, Streams
 
 NAMES = ["apo-pf", "de-pf", "pf", "pso-pf", "reference"]
 
 
 def run(scenario, name, seed=1, runs=range(6), **settings):
     with np.errstate(all="ignore"):
-        track = FILTERS.build(name, settings, "test").run(scenario, Streams(seed, runs, FILTER_PURPOSE))
+        track = FILTERS.build(name, settings, "test").run(scenario, Streams(seed, runs, Purpose.FILTER))
         return track, score(scenario, track)
 
 

@@ -46,6 +46,13 @@ def test_every_experiment_of_the_papers_is_there():
     assert [row[0] for row in reproduce.catalogue().rows] == sorted([*NAMES, *reproduce.voyages()])
 
 
+def test_names_look_into_every_file_once(monkeypatch):
+    read, load = [], reproduce.load_mapping
+    monkeypatch.setattr(reproduce, "load_mapping", lambda path: read.append(path) or load(path))
+    reproduce.names()
+    assert len(read) == len(set(read)) == len(NAMES) + len(reproduce.voyages())
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_experiment_builds_its_studies(name):
     experiment = reproduce.load(name)
