@@ -21,7 +21,7 @@ from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import setting
 from accelcal_cli.streams import Float, Streams
 
-EVOLUTION = ("F_min", "F_max", "CR_min", "CR_max", "mutation")
+EVOLUTION = ("weight_min", "weight_max", "crossover_min", "crossover_max", "mutation")
 IDLE = {
     "marginal": ("roughening", "threshold", "resampling", "state", "fraction", *EVOLUTION),
     "metropolis": ("fraction", "window", "inflation", "swell", *EVOLUTION),

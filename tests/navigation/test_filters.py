@@ -284,6 +284,6 @@ def test_a_setting_without_effect_on_its_road_is_refused(road, idle):
 
 
 def test_settings_with_effect_are_taken():
-    FILTERS.build("de-pf", {"road": "safe", "fraction": 0.4, "F_max": 0.7}, "de-pf")
+    FILTERS.build("de-pf", {"road": "safe", "fraction": 0.4, "weight_max": 0.7}, "de-pf")
     FILTERS.build("de-pf", {"road": "window", "window": 4}, "de-pf")
     FILTERS.build("de-pf", {"mode": "literal", "mutation": "rand-to-best"}, "de-pf")
