@@ -176,6 +176,10 @@ def test_parquet_stays_parquet(run, result, log):
     assert run("apply", result, "log.parquet", "-o", "out.parquet").code == 0
     assert run("apply", result, log, "-o", "out.csv").code == 0
     assert pl.read_parquet("out.parquet").equals(pl.read_csv("out.csv"))
+    with open("open.parquet", "wb") as file:
+        os.symlink(f"/dev/fd/{file.fileno()}", "link.parquet")
+        assert run("apply", result, "log.parquet", "-o", "link.parquet").code == 0
+    assert pl.read_parquet("open.parquet").equals(pl.read_csv("out.csv"))
     assert run("apply", result, "log.parquet", "-o", "again.csv").code == 0
     assert pl.read_csv("again.csv").equals(pl.read_csv("out.csv"))
 
