@@ -92,8 +92,7 @@ def command(
     check_target(output)
     options.check_input(port)
     capture = _capture(poses, fixture, round(window * rate), round(hold * rate), stated, unit)
-    with signals.raised():
-        _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
+    _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
 
 
 def _columns(text: str) -> list[int]:

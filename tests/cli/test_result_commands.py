@@ -461,22 +461,50 @@ def test_a_reader_that_leaves_is_no_error(shell, result, long_log):
     assert outcome.out.splitlines()[0] == "t,ax,ay,az,fx,fy,fz"
 
 
-def test_an_interrupt_is_one_line_and_leaves_no_file(environment, result, long_log, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, b"interrupted"),
+        (signal.SIGHUP, 129, b"ended by SIGHUP"),
+        (signal.SIGTERM, 143, b"ended by SIGTERM"),
+    ],
+)
+def test_an_interrupt_is_one_line_and_leaves_no_file(
+    environment, result, long_log, tmp_path, number, code, said
+):
     before = sorted(os.listdir(tmp_path))
+    program = _busy(environment, result, long_log, tmp_path)
+    program.send_signal(number)
+    out, error = program.communicate()
+    assert (program.returncode, out, error) == (code, b"", b"accelcal: %s\n" % said)
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+def test_a_hangup_that_is_ignored_as_nohup_has_it_ends_nothing(environment, result, long_log, tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        program = _busy(environment, result, long_log, tmp_path)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    program.send_signal(signal.SIGHUP)
+    program.communicate()
+    assert program.returncode == 0
+    assert (tmp_path / "out.csv").is_file()
+
+
+def _busy(environment, result, long_log, folder):
+    """Start `apply` and return it at work: when the pipe has taken the log, it is."""
     program = subprocess.Popen(
         [sys.executable, "-m", "accelcal_cli", "apply", result, "-", "-o", "out.csv"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        cwd=tmp_path,
+        cwd=folder,
         env=environment,
     )
-    program.stdin.write((tmp_path / long_log).read_bytes())  # when the pipe has taken it, it is at work
+    program.stdin.write((folder / long_log).read_bytes())
     program.stdin.flush()
-    program.send_signal(signal.SIGINT)
-    out, error = program.communicate()
-    assert (program.returncode, out, error) == (130, b"", b"accelcal: interrupted\n")
-    assert sorted(os.listdir(tmp_path)) == before
+    return program
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc to read the peak memory from")
