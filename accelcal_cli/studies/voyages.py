@@ -42,7 +42,7 @@ class Waters:
     plan: Plan = field(default_factory=Plan, metadata={"doc": "the planned voyage"})
     ins: Grade = field(default_factory=Grade, metadata={"doc": "the INS"})
     period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
-    noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", low=1e-6, high=1000.0)
+    noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", low=1e-3, high=1000.0)
     initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
     digests: str = field(default="", metadata={"doc": "SHA-256 of the files"})
 

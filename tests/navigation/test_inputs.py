@@ -335,7 +335,7 @@ def test_bad_usage_is_one_message(arguments, told):
             "plan: 0 s from filtered to hours; expected at least one period, 10 s",
         ),
         ("plan: {hours: 2.0025}", "plan: 9 s from filtered to hours"),
-        ("noise: 1.0e-300", "noise: 1e-300 is too small; expected at least 1e-06"),
+        ("noise: 1.0e-300", "noise: 1e-300 is too small; expected at least 0.001"),
     ],
 )
 def test_a_bad_key_of_the_file_is_one_message(tmp_path, text, told):
@@ -346,8 +346,15 @@ def test_a_bad_key_of_the_file_is_one_message(tmp_path, text, told):
 
 def test_two_measurements_are_enough_for_every_filter(tmp_path):
     path = tmp_path / "study.yaml"
-    path.write_text("plan: {hours: 2.0028}\nruns: 1\nnoise: 1.0e-6\n")
+    path.write_text("plan: {hours: 2.0028}\nruns: 1\nnoise: 1.0e-3\n")
     assert len(json.loads(navigate("--config", path, "--format", "json", "-q"))) == len(FILTERS.names())
+
+
+def test_a_filter_that_loses_every_hypothesis_has_diverged(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text("runs: 2\nnoise: 1.0e-3\n")  # a gravimeter that the map is far too coarse for
+    (row,) = json.loads(navigate("--config", path, "--filter", "reference", "--format", "json", "-q"))
+    assert row["diverged"] == 2
 
 
 def test_a_voyage_of_one_measurement_is_refused(tmp_path):
