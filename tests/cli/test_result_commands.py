@@ -347,6 +347,14 @@ EXPORT = {
         ["result.yaml", "--to", "px4", "--instance", "9", "--driver-scale", "1"],
         ["--instance 9", "0 to 3"],
     ),
+    "driver scale of ros": (
+        ["result.yaml", "--to", "ros", "--driver-scale", "2"],
+        ["--driver-scale: --to ros has no use for it", "px4, ardupilot, kalibr"],
+    ),
+    "instance of numpy": (
+        ["result.yaml", "--to", "numpy", "--instance", "0", "-o", "a.npz"],
+        ["--instance: --to numpy has no use for it"],
+    ),
     "negative instance": (["result.yaml", "--to", "px4", "--instance", "-1"], ["--instance", "-1"]),
     "no folder": (["result.yaml", "--to", "ros", "-o", "no/out.yaml"], ["no/out.yaml", "no such folder"]),
 }
