@@ -408,6 +408,19 @@ def test_every_command_refuses_a_bad_result(run, folder):
             assert sorted(os.listdir(folder)) == before, what
 
 
+def test_a_matrix_that_is_all_but_singular_is_no_fault(run, folder):
+    text = Path("result.yaml").read_text()
+    matrix = load_result("result.yaml").K_a
+    flat = matrix.copy()
+    flat[2] = matrix[1] + 1e-6 * matrix[2] / 1e3
+    lines = text.splitlines(keepends=True)
+    start, end = (next(k for k, line in enumerate(lines) if line.startswith(key)) for key in ("K_a:", "D_a:"))
+    Path("flat.yaml").write_text("".join([*lines[:start], f"K_a: {flat.tolist()}\n", *lines[end:]]))
+    for arguments in (("report", "flat.yaml", "-o", "flat.html"), ("export", "flat.yaml", "--to", "kalibr")):
+        outcome = run(*arguments)
+        assert outcome.code == 0, outcome.err
+
+
 @pytest.mark.parametrize(
     ("command", "cases"),
     [("apply", APPLY), ("verify", VERIFY), ("export", EXPORT), ("calibrate", ATTITUDES)],
