@@ -190,12 +190,14 @@ def _entry(item: Any, where: str) -> FilterEntry:
 def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
     """Return an INS whose accelerometers are as good as a calibration says.
 
-    The sigma of D_a by the diagonal of K_a, root mean square over the axes, is the sigma of the bias.
+    The sigma of D_a by the diagonal of K_a, root mean square over the axes, is the sigma of the bias. In gauge `full`
+    the axes may lie anywhere in the body: there it is the diagonal in gauge `lower`.
 
     Raises:
         DataError: the calibration does not determine the biases.
     """
-    sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(calibration.K_a))
+    K = calibration.model.in_gauge("lower").K if calibration.gauge == "full" else calibration.K_a
+    sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(K))
     if calibration.unit == "g":
         sigma = sigma * 9.80665
     value = float(np.sqrt(np.mean(np.square(sigma)))) / MICRO_G
