@@ -119,7 +119,10 @@ def _scalar(value: Any, hint: Any, label: str) -> Any:
     if hint is int and number and (isinstance(value, int) or value.is_integer()):
         return int(value)
     if hint is float and number:
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ConfigError(f"{label}: {_shown(value)} is too large; no number can be") from None
     if hint is float and isinstance(value, str):
         # YAML 1.1 reads 1e-6 (no dot) as text; the number is meant.
         try:

@@ -70,17 +70,18 @@ def _assembled(
             f"{readings.source}: the known attitudes span {found.rank} of 4 dimensions; turn the sensor to at least "
             f"four attitudes that do not lie in one plane, better {FEWEST_POSES} or more"
         )
+    _check_axes(readings, found)
     g, model = settings.g, found.model
     dop = np.sqrt(np.diagonal(found.cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
     nine = _nine(model)
     cofactor = nine @ np.kron(np.eye(3), found.cofactor) @ nine.T
-    size = np.sqrt(np.diagonal(model.K @ model.K.T))  # one unit of force along each sensor axis
+    size = _sizes(model)
     sigma_K = found.s * np.outer(size, dop[:3]) / g
     low = model.in_gauge("lower")
     force = low.specific_force(readings.output())
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
     modulus = np.linalg.norm(force, axis=1) - np.linalg.norm(reference, axis=1)
-    before, before_model = nominal_before(float(np.diagonal(model.K).mean()), model.D, settings)
+    before, before_model = nominal_before(float(size.mean()), model.D, settings)
     raw = np.linalg.norm(before_model.specific_force(readings.output()), axis=1) - g
     square = np.einsum("ji,ji->j", force, force)
     cost = float(np.sum((g * g - square) ** 2))
@@ -133,8 +134,29 @@ def _assembled(
     )
 
 
+def _check_axes(readings: Readings, found: Linear) -> None:
+    """Raise DataError when the outputs do not follow the force in all three directions."""
+    output = readings.output()
+    for name, column in zip(readings.columns, output.T, strict=True):
+        if np.ptp(column) == 0:
+            raise DataError(
+                f'{readings.source}: column "{name}" is {column[0]:g} in every pose; an axis that does not answer '
+                "cannot be calibrated"
+            )
+    if not np.isfinite(found.error).all():
+        raise DataError(
+            f"{readings.source}: columns {', '.join(readings.columns)} depend on each other; three sensor axes were "
+            "expected"
+        )
+
+
+def _sizes(model: ErrorModel) -> Float:
+    """Return the output of each sensor axis for one unit of force along it, shape (3,), however it lies in the body."""
+    return np.asarray(np.sqrt(np.diagonal(model.K @ model.K.T)))
+
+
 def _turned_round(model: ErrorModel) -> tuple[str, ...]:
-    if not (np.diagonal(model.K) < 0).all():
+    if not (np.diagonal(model.K) < -0.5 * _sizes(model)).all():  # each axis near the other end of its own
         return ()
     return (
         "All scale factors are negative: the reference, or the sensor, counts gravity instead of specific force, which "

@@ -10,6 +10,7 @@ triangle that holds the cost of 12 readings or of 12 million exactly (calibratio
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,7 +113,7 @@ class Loetters(Problem):
         From dA = -A dK A and dM = [dA | -dA d - A dd], column by column.
         """
         K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
-        A = np.linalg.inv(K)
+        A = _inverse(K)
         M = np.concatenate([A, -(A @ d[..., None])], axis=-1)  # dM for dK_ij is -A e_i (row j of M)
         columns = []
         for i, j in ROWS_COLUMNS[: self.unknowns - 3]:
@@ -139,7 +140,7 @@ class Loetters(Problem):
         """
         J, r = self.jacobian(x), self.residuals(x)
         K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
-        A = np.linalg.inv(K)
+        A = _inverse(K)
         M = np.concatenate([A, -(A @ d[..., None])], axis=-1)
         Y = _symmetric((self._R.swapaxes(1, 2)[:, None] @ r[..., None])[..., 0])
         dK = np.zeros((self.unknowns, 3, 3))
@@ -195,6 +196,14 @@ class Loetters(Problem):
         np.add.reduce(products, axis=2, out=q[:, :10])
         q[:, 10] = -1.0
         return q
+
+
+def _inverse(K: Float) -> Float:
+    """Return K^-1, shape (..., 3, 3); NaN where K is singular, so that one run's fate is not that of the batch."""
+    with suppress(np.linalg.LinAlgError):
+        return np.linalg.inv(K)
+    regular = (np.linalg.det(K) != 0)[..., None, None]
+    return np.where(regular, np.linalg.inv(np.where(regular, K, np.eye(3))), np.nan)
 
 
 def _quadratic_change(M: Float, dM: Float) -> Float:

@@ -11,6 +11,7 @@ import numpy as np
 from accelcal_cli.calibration import record as records
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
 from accelcal_cli.calibration.quality import Verdict
+from accelcal_cli.calibration.settings import LARGEST
 from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.model import GAUGES
@@ -54,7 +55,12 @@ def checked(name: str, value: Any, where: str) -> Any:
         DataError: another kind or shape, or a part missing.
     """
     try:
+        records.check_size(value)
         return _rebuild(name, value)
+    except OverflowError:
+        raise DataError(
+            f"{where}: not a calibration result: {name}: holds a number that is too large"
+        ) from None
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else error
         raise DataError(f"{where}: not a calibration result: {name}: {reason}") from None
@@ -97,6 +103,8 @@ def _pose_fit(row: Mapping[str, Any]) -> PoseFit:
 
 def _matrix(name: str, value: Any) -> Float:
     found = records.array(value, SHAPES[name], whole=name in WHOLE)
-    if name == "K_a" and np.linalg.matrix_rank(found) < 3:
+    if name == "K_a" and not (np.abs(found) <= LARGEST).all():
+        raise ValueError(f"holds a number beyond {LARGEST:g}")
+    if name == "K_a" and not (np.abs(found).max() >= 1 / LARGEST and np.linalg.matrix_rank(found) == 3):
         raise ValueError("is singular; expected an invertible matrix")
     return found

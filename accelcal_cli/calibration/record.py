@@ -11,6 +11,9 @@ import numpy as np
 
 from accelcal_cli.streams import Float
 
+MOST = 2**53
+"""Largest count: up to here floats hold every whole number."""
+
 
 def plain(value: Any) -> Any:
     """Return a value as plain mappings, lists, numbers and text; NaN and inf become None."""
@@ -59,7 +62,22 @@ def of_kind(value: Any, kinds: tuple[type, ...], words: str) -> Any:
     """
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         raise ValueError(f"{value!r} where {words} was expected")
+    if kinds == (int,) and isinstance(value, int) and abs(value) > MOST:
+        raise ValueError(f"a number beyond {MOST} where {words} was expected")
     return value
+
+
+def check_size(value: Any, depth: int = 4) -> None:
+    """Refuse a whole number that no float can be, in a value or in lists and mappings `depth` deep.
+
+    Raises:
+        OverflowError: there is one.
+    """
+    if isinstance(value, int):
+        float(value)
+    elif depth and isinstance(value, list | Mapping):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            check_size(part, depth - 1)
 
 
 def or_nan(value: Any) -> float:

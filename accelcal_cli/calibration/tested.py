@@ -38,7 +38,7 @@ class Tests:
 
     @classmethod
     def of(cls, old: Calibration, found: Shift) -> Self:
-        """Test what the new readings say against the old result."""
+        """Test what the new readings say against the old result; NaN is the chance where they determine nothing."""
         floor = (ROUNDING * old.g) ** 2
         a, b = old.s**2, found.noise.variance
         pair = Pair.of(Noise(max(a, floor), old.freedom), Noise(max(b, floor), found.noise.freedom))
@@ -46,7 +46,7 @@ class Tests:
         covariance = pair.a.variance * A + pair.b.variance * B
         d = basis.T @ found.value
         chi_square = float(d @ np.linalg.solve(basis.T @ covariance @ basis, d))
-        together = pair.chance(d, basis.T @ A @ basis, basis.T @ B @ basis)
+        together = pair.chance(d, basis.T @ A @ basis, basis.T @ B @ basis) if len(d) else float("nan")
         single = np.array([pair.chance(found.value[[p]], A[[p]][:, [p]], B[[p]][:, [p]]) for p in range(9)])
         chance = chances.combined(np.append(single[found.known], together))
         return cls(pair, covariance, chi_square, together, single, chance)

@@ -16,6 +16,7 @@ from accelcal_cli.calibration import doubts as hidden
 from accelcal_cli.calibration import record as records
 from accelcal_cli.calibration.cautions import ratio_in_words
 from accelcal_cli.calibration.chances import Pair
+from accelcal_cli.calibration.foreign import check_unit, strange
 from accelcal_cli.calibration.quality import PARAMETERS
 from accelcal_cli.calibration.residuals import modulus_errors, square_error
 from accelcal_cli.calibration.result import Calibration
@@ -26,10 +27,6 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.sensor.readings import Readings
 
 SCHEMA = "accelcal/verification/1"
-
-
-STRANGE = 0.5
-"""Readings off by this part of g are rather in another unit than of a sensor that changed."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +117,12 @@ def verify(
         tolerance: largest rms of |f| - g, m/s^2, or None.
 
     Raises:
-        DataError: the result states no uncertainty, so that there is nothing to compare with.
+        DataError: the result states no uncertainty, so that there is nothing to compare with; or no reading is near g
+            under it, as in another unit.
     """
     _check(old)
     readings, warmth = _at_reference(old, readings)
+    check_unit(old, readings)
     found = shift(old, readings)
     tests = Tests.of(old, found)
     doubts = hidden.doubts(old, tests.pair, readings)
@@ -133,7 +132,7 @@ def verify(
     return Verification(
         verdict=verdict,
         reasons=(
-            *_strange(rms, old),
+            *strange(rms, old),
             *_reasons(verdict, differences, found, tests.pair, level),
             *(doubts if verdict == "inconclusive" else ()),
             *warmth,
@@ -160,8 +159,11 @@ def verify(
 
 
 def _verdict(chance: float, level: float, doubts: tuple[str, ...], readings: Readings) -> str:
-    """Return the verdict; where there are doubts a change has to be certain, and of rows that are no poses none is."""
-    if doubts:
+    """Return the verdict; where there are doubts a change has to be certain, and of rows that are no poses none is.
+
+    A chance that is no number, for readings that no direction is seen of, says nothing.
+    """
+    if doubts or np.isnan(chance):
         certain = chance < min(level, hidden.SURELY) and not readings.cautions
         return "changed" if certain else "inconclusive"
     return "changed" if chance < level else "unchanged"
@@ -172,15 +174,6 @@ def _rms(old: Calibration, readings: Readings) -> float:
     model = old.model.in_gauge("lower")
     squares = sum(square_error(e, old.g) for _, e, _ in modulus_errors(readings, model, old.g))
     return float(np.sqrt(squares / readings.poses))
-
-
-def _strange(rms: float, old: Calibration) -> tuple[str, ...]:
-    """Return a warning of readings that no ageing explains."""
-    if rms < STRANGE * old.g:
-        return ()
-    return (
-        f"Under the result they miss g by {rms:.3g} {old.unit}: another unit than its readings, or another sensor?",
-    )
 
 
 def _check(old: Calibration) -> None:

@@ -72,7 +72,7 @@ def command(
     ended before all poses were taken.
     """
     from accelcal_cli.calibration.planner import FIXTURES
-    from accelcal_cli.output.files import check_target
+    from accelcal_cli.output.files import check_target, is_stream
 
     if fixture not in FIXTURES[:-1]:
         raise UsageError(f'--fixture "{fixture}": expected one of {", ".join(FIXTURES[:-1])}')
@@ -87,13 +87,12 @@ def command(
         )
     stated = still, _unit(unit), _offset(offset)
     options.check_apart([port], {"-o": output})
-    if Path(output).is_file() and not overwrite:
+    if Path(output).is_file() and not (overwrite or is_stream(output)):
         raise UsageError(f'-o "{output}": exists already; expected a new name, or --overwrite')
     check_target(output)
     options.check_input(port)
     capture = _capture(poses, fixture, round(window * rate), round(hold * rate), stated, unit)
-    with signals.raised():
-        _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
+    _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
 
 
 def _columns(text: str) -> list[int]:

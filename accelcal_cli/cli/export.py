@@ -18,7 +18,14 @@ def command(
     result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
     to: Annotated[str, typer.Option(help=f"Format: {NAMES}.", metavar="FORMAT")],
     output: Annotated[str, typer.Option("--output", "-o", help="File to write; - is standard output.")] = "-",
-    instance: Annotated[int, typer.Option(help="Number of the accelerometer in the target.", min=0)] = 0,
+    instance: Annotated[
+        int | None,
+        typer.Option(
+            help="Number of the accelerometer in the target (px4, ardupilot, kalibr).",
+            min=0,
+            show_default="0",
+        ),
+    ] = None,
     driver_scale: Annotated[
         float | None,
         typer.Option(
@@ -35,10 +42,12 @@ def command(
     Warns of what the format cannot hold. PX4 and ArduPilot have no misalignments.
     """
     from accelcal_cli.calibration.exporters.base import Target
-    from accelcal_cli.calibration.exporters.formats import check_name, export
+    from accelcal_cli.calibration.exporters.formats import check_name, check_options, export
     from accelcal_cli.output.files import check_target, whole_file
 
     check_name(to)
+    stated = {"--instance": instance, "--driver-scale": driver_scale}
+    check_options(to, [option for option, value in stated.items() if value is not None])
     if driver_scale is not None and not (math.isfinite(driver_scale) and driver_scale > 0):
         raise UsageError(f"--driver-scale {driver_scale:g}: expected a positive number")
     options.check_apart([result], {"-o": output})
@@ -48,7 +57,7 @@ def command(
     calibration = options.load_result(result)
     calibration.check_determined(result, force=force)
     options.caution(result, calibration.cautions, quiet)
-    made = export(calibration, to, Target(instance, driver_scale))
+    made = export(calibration, to, Target(instance or 0, driver_scale))
     with whole_file(output, binary=True) as file:
         file.write(made.content)
     sys.stdout.flush()

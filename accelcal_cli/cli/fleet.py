@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from accelcal_cli.cli import options, pipes
-from accelcal_cli.errors import UsageError
+from accelcal_cli.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -84,9 +84,14 @@ def command(
     folder = output is not None and _check_output(output)
     stated_g = options.gravity(g, latitude, height)
     stated: dict[str, Any] = {"g": stated_g, "gauge": gauge, "weights": weights}
-    if config is None or "optimizer" not in load_mapping(config):
+    filed = {} if config is None else load_mapping(config)
+    if "optimizer" not in filed:
         stated["optimizer"] = "levenberg-marquardt"
     settings = load_settings(config, {k: v for k, v in stated.items() if v is not None})
+    if filed.get("temperature") is True:  # the default asks for nothing, a file does
+        raise ConfigError(
+            f"{config}: temperature: true: a fleet goes without slopes; calibrate this sensor by itself"
+        )
     check_settings(settings)
     readings = read_fleet(data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer)
     if folder and output is not None:

@@ -16,7 +16,7 @@ import typer.core
 import typer.main
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import pipes
+from accelcal_cli.cli import pipes, signals
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -83,7 +83,7 @@ class Made(Mapping[str, Any]):
 
 
 class Commands(typer.core.TyperGroup):
-    """The commands; keeps typer from taking a reader that left (`| head -1`) for a failure."""
+    """The commands; keeps typer from taking a reader that left (`| head -1`) for a failure, or a signal for Ctrl-C."""
 
     def __init__(self, **attributes: Any) -> None:
         """Make the group of all commands."""
@@ -94,6 +94,8 @@ class Commands(typer.core.TyperGroup):
         """Run a command; leave quietly when the reader of its output has gone."""
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            raise signals.interrupted(stop) from None
         except BrokenPipeError:
             _leave_pipe()
 
@@ -123,10 +125,11 @@ def options(
 
 
 def main() -> None:
-    """Run the command line; exit 0 done, 1 done with a bad verdict, 2 bad input, 130 interrupted."""
+    """Run the command line; exit 0 done, 1 done with a bad verdict, 2 bad input, 128 + n by signal n."""
     _open_streams()
     try:
-        code = app(prog_name="accelcal", standalone_mode=False)
+        with signals.raised():
+            code = app(prog_name="accelcal", standalone_mode=False)
     except AccelcalError as error:
         _fail(str(error), BAD_INPUT)
     except BadUsage as error:

@@ -69,8 +69,10 @@ def command(
         Path | None, typer.Option(help="YAML file: voyage, INS, map, filters and their parameters.")
     ] = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option(help="Result of accelcal calibrate: its bias sigma, beside the INS without it."),
+        str | None,
+        typer.Option(
+            help="Result of accelcal calibrate: its bias sigma, beside the INS without it; - is standard input."
+        ),
     ] = None,
     output: Annotated[
         str | None,
@@ -126,23 +128,23 @@ def _study(
     settings: dict[str, Any],
     runs: int | None,
     seed: int | None,
-    calibration: Path | None,
+    calibration: str | None,
 ) -> Navigation:
     """Return the study that file and command line state together."""
-    from accelcal_cli.registry import convert
+    from accelcal_cli.registry import build
     from accelcal_cli.studies.entries import words
     from accelcal_cli.studies.navigation import Navigation
-    from accelcal_cli.studies.voyages import load_waters
+    from accelcal_cli.studies.voyages import Repeats, load_waters
 
     waters, own, further = load_waters(config, stated)
-    where = str(config)
-    repeats = runs or convert(further.get("runs", 20), int, f"{where}: runs")
-    number = seed if seed is not None else convert(further.get("seed", 0), int, f"{where}: seed")
+    filed: dict[str, Any] = {key: further[key] for key in ("runs", "seed") if key in further}
+    said = {key: value for key, value in (("runs", runs), ("seed", seed)) if value is not None}
+    repeats = build(Repeats, {**filed, **said}, str(config or "command line"))
     entries = _entries(words(names), own, mode, settings)
     grades: tuple[Grade, ...] = (waters.ins,)
     if calibration is not None:
         waters, grades = _calibrated(waters, calibration)
-    return Navigation(waters.hashed(), tuple(entries), grades, repeats, number)
+    return Navigation(waters.hashed(), tuple(entries), grades, repeats.runs, repeats.seed)
 
 
 def _entries(
@@ -160,20 +162,18 @@ def _entries(
     return [limited(entry, {**settings, "mode": each}) for each in modes for entry in chosen]
 
 
-def _calibrated(waters: Waters, path: Path) -> tuple[Waters, tuple[Grade, ...]]:
+def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]:
     """Return waters and the INS without and with a calibration.
 
     The accelerometers are strapped down: on a platform an alignment hides their biases. Any drift is taken that the
     filters can start with.
     """
-    from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.config import load_mapping
     from accelcal_cli.studies.voyages import grade_of
 
-    result = Calibration.from_record(load_mapping(path), str(path))
+    result = options.load_result(source)
     free = replace(waters, plan=replace(waters.plan, drift=(0.0, waters.initial)))
     ins = replace(waters.ins, mounting="strapdown")
-    return free, (ins, grade_of(result, ins, str(path)))
+    return free, (ins, grade_of(result, ins, source))
 
 
 def show(study: Navigation, records: Sequence[Record], format: str) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from accelcal_cli.cli import signals
 from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
 
 if TYPE_CHECKING:
@@ -86,8 +87,9 @@ def run(
             records = run_study(study, journal, _executors(study, jobs, cluster), progress)
         if raw is not None:
             write_raw(raw_table(study, records), raw)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted{_kept(journal)}") from None
+    except KeyboardInterrupt as stop:
+        ending = signals.interrupted(stop)
+        raise Interrupted(f"{ending}{_kept(journal)}", ending.code) from None
     except AccelcalError as error:
         raise type(error)(f"{error}{_kept(journal)}") from None
     journal.remove()

@@ -1,4 +1,4 @@
-"""HUP and TERM taken as Ctrl-C is, by a command that has something to keep when it is ended."""
+"""HUP and TERM taken as Ctrl-C is: what a command had begun to write goes, and what it keeps is kept."""
 
 from __future__ import annotations
 

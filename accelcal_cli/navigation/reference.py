@@ -161,7 +161,7 @@ def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
 def _pruned(bank: Bank, runs: int) -> Bank:
     """Return the bank without hopeless components."""
     weight = _weights(bank, runs)
-    keep = weight > HOPELESS
+    keep = ~(weight <= HOPELESS)  # a diverged run has weights that are no numbers, and stays so
     return bank if keep.all() else bank.at(keep)
 
 

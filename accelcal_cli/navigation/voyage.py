@@ -57,6 +57,11 @@ class Plan:
                 f"filtered: {self.filtered:g} h; expected less than the voyage's {self.hours:g} h"
             )
 
+    @property
+    def seconds(self) -> int:
+        """Time that the filter runs. Definition: hours - filtered, each in whole seconds. Units: s."""
+        return round(self.hours * SECONDS_PER_HOUR) - round(self.filtered * SECONDS_PER_HOUR)
+
 
 @dataclass(frozen=True)
 class Route:

@@ -45,7 +45,8 @@ def read_voyage(path: str, period: float) -> Recorded:
     """Return a recorded voyage at the epochs of a period in s.
 
     Raises:
-        DataError: unreadable, a column missing, a gap in time, or rows that are no multiple of the period apart.
+        DataError: unreadable, a column missing, a gap in time, rows that are no multiple of the period apart, or less
+            than a period from first to last.
     """
     table, lines = _rows(path)
     seconds = table["time"]
@@ -63,6 +64,10 @@ def read_voyage(path: str, period: float) -> Recorded:
     stride = round(period / usual)
     if stride < 1 or abs(stride * usual - period) > 0.01 * period:
         raise DataError(f"{path}: rows are {usual:g} s apart; --period {period:g} is no multiple of that")
+    if len(seconds) <= stride:
+        raise DataError(
+            f"{path}: {len(seconds)} rows, {usual:g} s apart, hold one measurement at --period {period:g}; expected two"
+        )
     return Recorded(path, {name: values[::stride] for name, values in table.items()})
 
 

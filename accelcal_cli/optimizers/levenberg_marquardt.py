@@ -2,11 +2,13 @@
 
 Levenberg 1944, Marquardt 1963; the damping schedule is Nielsen's [nielsen1999]. A coordinate that sits on a
 wall of the box while the gradient pushes it outwards is held there for the step. With 12 unknowns J^T J has
-three zero singular values; the damping keeps the system solvable and the step in the valley stays small.
+three zero singular values; the damping keeps the system solvable and the step in the valley stays small. A run none
+of whose points has a step (a Jacobian that is zero or no number) has failed.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,7 +64,7 @@ class LevenbergMarquardt(Optimizer):
         """Try one damped step at every point; keep it where the cost falls."""
         x, fx = state.x, state.fx
         held = ((x <= problem.lower) & (state.gradient > 0)) | ((x >= problem.upper) & (state.gradient < 0))
-        delta = _solve(state, held)
+        delta, usable = _solve(state, held)
         trial = np.clip(x + delta, problem.lower, problem.upper)
         r = problem.residuals(trial)
         trial_cost = np.einsum("rpm,rpm->rp", r, r)
@@ -82,6 +84,7 @@ class LevenbergMarquardt(Optimizer):
         fx = np.where(better, trial_cost, fx)
         status = _status(fx)
         status[done & (status == RUNNING)] = CONVERGED
+        status[~usable.any(axis=1)] = FAILED
         return replace(
             state,
             x=x,
@@ -103,8 +106,11 @@ def _normal_equations(problem: Problem, x: Float, r: Float) -> tuple[Float, Floa
     return transposed @ jacobian, (transposed @ r[..., None])[..., 0]
 
 
-def _solve(state: DampedState, held: Bool) -> Float:
-    """Return the step (J^T J + lambda diag(J^T J))^-1 (-J^T r) with the held coordinates at rest."""
+def _solve(state: DampedState, held: Bool) -> tuple[Float, Bool]:
+    """Return the step (J^T J + lambda diag(J^T J))^-1 (-J^T r) with the held coordinates at rest, and where it exists.
+
+    Shapes (R, P, D) and (R, P); where there is no step it is 0.
+    """
     scale = np.einsum("rpdd->rpd", state.normal)
     # A floor keeps a coordinate without influence (a pose set that says nothing of it) from dividing by zero.
     scale = np.maximum(scale, 1e-12 * scale.max(axis=2, keepdims=True))
@@ -119,8 +125,20 @@ def _solve(state: DampedState, held: Bool) -> Float:
     )
     matrix = np.where(usable[..., None, None], matrix, np.eye(len(index)))
     right = np.where(held | ~usable[..., None], 0.0, -state.gradient)
-    step: Float = np.linalg.solve(matrix, right[..., None])[..., 0]
-    return step
+    step = _solutions(matrix, right)
+    usable &= np.isfinite(step).all(axis=2)
+    return np.where(usable[..., None], step, 0.0), usable
+
+
+def _solutions(matrix: Float, right: Float) -> Float:
+    """Return the solutions of systems of shape (R, P, D, D), shape (R, P, D); NaN for a singular one."""
+    with suppress(np.linalg.LinAlgError):
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
+    found = np.full_like(right, np.nan)
+    for place in np.ndindex(right.shape[:2]):  # numpy does not say which of them it was
+        with suppress(np.linalg.LinAlgError):
+            found[place] = np.linalg.solve(matrix[place], right[place])
+    return found
 
 
 def _status(fx: Float) -> np.ndarray[tuple[int], np.dtype[np.int8]]:

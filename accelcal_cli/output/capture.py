@@ -5,11 +5,10 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import IO
 
-from accelcal_cli.output.files import check_target, unwritten, whole_file
+from accelcal_cli.output.files import check_target, is_stream, open_stream, unwritten, whole_file
 from accelcal_cli.sensor.capture import Held
 
 HEADER = "pose,n,Nx,Ny,Nz,sx,sy,sz\n"
@@ -74,11 +73,11 @@ class PoseFile:
         """Return standard output, a pipe or a device; None for a file."""
         if self.path == "-":
             return sys.stdout  # as it is now: a picture on the terminal puts another in its place
-        if not Path(self.path).exists() or Path(self.path).is_file():
+        if not is_stream(self.path):
             return None
         try:  # without a buffer, which would try to get rid of what a full device refused, again and again
             return io.TextIOWrapper(
-                io.FileIO(self.path, "w"), encoding="utf-8", newline="\n", write_through=True
+                open_stream(self.path), encoding="utf-8", newline="\n", write_through=True
             )
         except OSError as error:
             raise unwritten(self.path, error) from None

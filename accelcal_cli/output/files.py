@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,6 +16,12 @@ from accelcal_cli.errors import OutputError
 
 PROBE = 4096
 """Bytes that a file system must have room for before any work is done: it gives room by blocks of this size."""
+
+MARK, UNFINISHED = ".accelcal-", ".part"
+"""Of the name of a temporary file: short, so that any name that a file can have is one that it can be given."""
+
+MOST_LINKS = 40
+"""Symbolic links one after the other that Linux follows."""
 
 
 def check_target(path: str) -> None:
@@ -25,17 +32,14 @@ def check_target(path: str) -> None:
     """
     if path == "-":
         return
-    target = Path(path)
-    if target.is_dir():
-        raise OutputError(f"{path}: is a directory; expected the name of a file")
-    folder = target.parent
-    if not folder.is_dir():
-        raise OutputError(f"{path}: no such folder: {folder}")
-    if not os.access(folder, os.W_OK) or (target.exists() and not os.access(target, os.W_OK)):
-        raise OutputError(f"{path}: permission denied")
-    if target.exists() and not target.is_file():
-        return
+    target = _target(path)
     try:
+        if target.is_dir():
+            raise OutputError(f"{path}: is a directory; expected the name of a file")
+        if is_stream(path):
+            _check_stream(path)
+            return
+        _check_name(path, target)
         handle, temporary = _part(target)
         try:
             with open(handle, "wb", buffering=0) as file:
@@ -46,14 +50,67 @@ def check_target(path: str) -> None:
         raise unwritten(path, error) from None
 
 
+def _check_name(path: str, target: Path) -> None:
+    folder = target.parent
+    if not folder.is_dir():
+        raise OutputError(f"{path}: no such folder: {folder}")
+    if not os.access(folder, os.W_OK) or (target.exists() and not os.access(target, os.W_OK)):
+        raise OutputError(f"{path}: permission denied")
+    with suppress(FileNotFoundError):
+        target.stat()  # a name that is too long, or links in a ring
+
+
+def _check_stream(path: str) -> None:
+    descriptor = _descriptor(path)
+    if descriptor is not None:
+        os.fstat(descriptor)  # open
+    elif not os.access(path, os.W_OK):
+        raise OutputError(f"{path}: permission denied")
+
+
+def is_stream(path: str) -> bool:
+    """Whether a name is a pipe, a device, or what this process has open (/dev/stdout): nothing can take its place."""
+    target = Path(path)
+    return _descriptor(path) is not None or (target.exists() and not (target.is_file() or target.is_dir()))
+
+
+def open_stream(path: str) -> io.FileIO:
+    """Open a stream, without a buffer; what is open already goes on where it is.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    descriptor = _descriptor(path)
+    return io.FileIO(path if descriptor is None else os.dup(descriptor), "w")
+
+
+def _descriptor(path: str) -> int | None:
+    """Return the number of what a name has open in this process, as 1 for /dev/stdout and 3 for /dev/fd/3."""
+    for _ in range(MOST_LINKS):
+        folder, name = os.path.realpath(os.path.dirname(path)), os.path.basename(path)
+        if folder in ("/dev/fd", f"/proc/{os.getpid()}/fd") and name.isdecimal():
+            return int(name)
+        if not os.path.islink(path):
+            break
+        path = os.path.join(folder, os.readlink(path))
+    return None
+
+
+def _target(path: str) -> Path:
+    """Return the file that a name stands for: where it is a symbolic link, what that leads to."""
+    return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+
+
 def _part(target: Path) -> tuple[int, str]:
     """Make a temporary file beside the one that is to be; return its open handle and its name."""
-    return tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    return tempfile.mkstemp(prefix=MARK, suffix=UNFINISHED, dir=target.parent)
 
 
 @contextmanager
 def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
     """Open a file that appears under its name only when all of it was written; "-" is standard output.
+
+    A symbolic link stays: the file that it leads to is replaced. A stream is written as it comes.
 
     Args:
         path: its name, or "-".
@@ -66,25 +123,30 @@ def whole_file(path: str, *, binary: bool = False) -> Iterator[IO[Any]]:
         yield sys.stdout.buffer if binary else sys.stdout
         return
     check_target(path)
-    target = Path(path)
-    text = {} if binary else {"encoding": "utf-8", "newline": "\n"}
-    device = target.exists() and not target.is_file()  # a pipe or a device, which must not be replaced
-    temporary = ""
+    target, temporary = _target(path), ""
     try:
-        if not device:
-            handle, temporary = _part(target)
-            os.close(handle)
-        with open(temporary or target, "wb" if binary else "w", **text) as file:  # type: ignore[call-overload]
+        if is_stream(path):
+            with _opened(open_stream(path), binary) as file:
+                yield file
+            return
+        handle, temporary = _part(target)
+        os.close(handle)
+        with _opened(io.FileIO(temporary, "w"), binary) as file:  # by its name, which polars asks for
             yield file
-        if not device:
-            os.chmod(temporary, _mode(target))
-            os.replace(temporary, target)
-            temporary = ""
+        os.chmod(temporary, _mode(target))
+        os.replace(temporary, target)
+        temporary = ""
     except OSError as error:
         raise unwritten(path, error) from None
     finally:
         if temporary:
             Path(temporary).unlink(missing_ok=True)
+
+
+def _opened(raw: io.FileIO, binary: bool) -> IO[Any]:
+    """Return an unbuffered file with a buffer, for bytes or for text."""
+    file = io.BufferedWriter(raw)
+    return file if binary else io.TextIOWrapper(file, encoding="utf-8", newline="\n")
 
 
 def check_folder(path: str) -> None:
@@ -109,10 +171,9 @@ def whole_folder(path: str) -> Iterator[Path]:
         OutputError: it cannot be written, or holds something already; nothing is left behind.
     """
     check_folder(path)
-    target = Path(path)
-    temporary = ""
+    target, temporary = _target(path), ""
     try:
-        temporary = tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        temporary = tempfile.mkdtemp(prefix=MARK, suffix=UNFINISHED, dir=target.parent)
         yield Path(temporary)
         os.chmod(temporary, _mode(target, 0o777))
         if target.is_dir():

@@ -21,6 +21,8 @@ from accelcal_cli.streams import Float, Int
 MOST_POSES = 20_000_000
 """Poses with a label of their own in one table, at most."""
 
+COLD = "Temperature column not used: slopes with temperature go sensor by sensor, with calibrate."
+
 
 def read_fleet(
     sources: Sequence[str],
@@ -116,7 +118,7 @@ class _Gathering:
                 columns.names,
                 first,
                 where,
-                columns.notes,
+                columns.notes if columns.temperature is None else (*columns.notes, COLD),
                 rows=means is None,
                 timed=columns.time is not None,
             )

@@ -14,12 +14,15 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.linalg import cholesky, eigh, inv
+from numpy.linalg import cholesky, eigh, inv, qr, svd
 
 from accelcal_cli.streams import Float
 
 Gauge = Literal["lower", "upper", "symmetric", "full"]
 GAUGES: tuple[str, ...] = get_args(Gauge)
+
+SQUARABLE = 1e-6
+"""Least part that the smallest singular value of K is of the largest, if K K^T is to keep digits of it."""
 
 
 def to_gauge(K: Float, gauge: str) -> Float:
@@ -31,19 +34,35 @@ def to_gauge(K: Float, gauge: str) -> Float:
         the polar factor, closest to no rotation. full: as it is.
 
     Args:
-        K: shape (..., 3, 3), output units per m/s^2.
+        K: shape (..., 3, 3), finite and not singular, output units per m/s^2.
         gauge: one of GAUGES.
     """
     if gauge == "full":
         return K
-    product = K @ K.swapaxes(-1, -2)
-    if gauge == "lower":
-        return cholesky(product)
     if gauge == "upper":
-        return cholesky(product[..., ::-1, ::-1])[..., ::-1, ::-1]
+        return to_gauge(K[..., ::-1, :], "lower")[..., ::-1, ::-1]
+    sizes = svd(K, compute_uv=False)
+    poor = sizes[..., 2] < SQUARABLE * sizes[..., 0]
+    squared = np.where(poor[..., None, None], np.eye(3), K)
+    product = squared @ squared.swapaxes(-1, -2)
+    if gauge == "lower":
+        found = cholesky(product)
+        if poor.any():
+            found[poor] = triangular(K[poor])
+        return found
     values, vectors = eigh(product)
     root: Float = (vectors * np.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2)
+    if poor.any():
+        axes, sizes, _ = svd(K[poor])
+        root[poor] = (axes * sizes[:, None, :]) @ axes.swapaxes(-1, -2)
     return root
+
+
+def triangular(K: Float) -> Float:
+    """Return K in gauge `lower`, shape (R, 3, 3), for any finite K: K Q with Q from the QR of K^T."""
+    R: Float = qr(K.swapaxes(1, 2), mode="r")  # type: ignore[assignment]  # typed as "reduced"
+    sign = np.where(np.einsum("rii->ri", R) < 0, -1.0, 1.0)
+    return R.swapaxes(1, 2) * sign[:, None]
 
 
 @dataclass(frozen=True, eq=False)

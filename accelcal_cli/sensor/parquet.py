@@ -124,7 +124,13 @@ class ParquetTable:
             raise DataError(f"{where}: {what}; a finite number was expected")
 
     def _labels(self, frame: pl.DataFrame, start: int, column: int) -> list[str]:
-        labels: list[str | None] = frame[self.names[column]].cast(pl.String).to_list()
+        series = frame[self.names[column]]
+        try:
+            labels: list[str | None] = series.cast(pl.String).to_list()
+        except pl.exceptions.PolarsError:  # lists, or bytes that are no UTF-8
+            raise DataError(
+                f'{self.name}, column "{series.name}": holds {series.dtype}; text or numbers were expected as labels'
+            ) from None
         for row, label in enumerate(labels):
             if not label:
                 where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'

@@ -32,7 +32,7 @@ def to_text(table: Table, change: Change, file: IO[bytes]) -> None:
 
 
 def to_parquet(table: Table, change: Change, file: IO[bytes]) -> None:
-    """Write the changed log as Parquet into a named file.
+    """Write the changed log as Parquet, by the name of the file if it has one.
 
     Raises:
         OSError: it cannot be written.
@@ -51,7 +51,10 @@ def to_parquet(table: Table, change: Change, file: IO[bytes]) -> None:
         except BaseException as problem:  # polars would wrap it beyond recognition
             fault.append(problem)
 
+    target = (
+        file.name if isinstance(file.name, str) else file
+    )  # what was open already has no name, but a number
     with system_errors():
-        register_io_source(source, schema=first.schema).sink_parquet(file.name)
+        register_io_source(source, schema=first.schema).sink_parquet(target)
     if fault:
         raise fault[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from accelcal_cli.calibration.lotters import pack
+from accelcal_cli.sensor.model import triangular
 from accelcal_cli.sensor.units import ARCSEC, MICRO_G, PPM
 from accelcal_cli.streams import Float
 from accelcal_cli.studies.scene import Scene
@@ -64,9 +65,6 @@ def _rms(values: Float) -> Float:
 
 
 def in_lower(K: Float) -> Float:
-    """Return K in gauge `lower` for any K, a search's failure included: K Q with Q from the QR of K^T."""
-    finite = np.asarray(np.isfinite(K).all(axis=(1, 2)))
-    usable = np.where(finite[:, None, None], K, np.eye(3))
-    R: Float = np.linalg.qr(usable.swapaxes(1, 2), mode="r")  # type: ignore[assignment]  # typed as "reduced"
-    sign = np.where(np.einsum("rii->ri", R) < 0, -1.0, 1.0)
-    return np.where(finite[:, None, None], R.swapaxes(1, 2) * sign[:, None], np.nan)
+    """Return K in gauge `lower`, shape (R, 3, 3), for any K, a search's failure included: NaN where it is no number."""
+    finite = np.asarray(np.isfinite(K).all(axis=(1, 2)))[:, None, None]
+    return np.where(finite, triangular(np.where(finite, K, np.eye(3))), np.nan)

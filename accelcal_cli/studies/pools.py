@@ -28,6 +28,8 @@ def local_pool(jobs: int) -> Iterator[Executor]:
     The worker processes are new ones (spawn): a fork would copy locks and threads in whatever state they are.
     """
     others = active_children()
+    with _undisturbed():
+        resource_tracker.ensure_running()  # by itself: its start lifts the mask of the interrupt key
     pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_work)
     try:
         with _worker_surroundings():
@@ -35,7 +37,7 @@ def local_pool(jobs: int) -> Iterator[Executor]:
                 pool.submit(os.getpid)  # starts a worker
         yield pool
     except BaseException:
-        with _no_interrupt():  # a second key press waits until the workers have gone
+        with _undisturbed():  # a second key press waits until the workers have gone
             for process in active_children():
                 if process not in others:
                     process.terminate()
@@ -46,12 +48,11 @@ def local_pool(jobs: int) -> Iterator[Executor]:
 
 @contextmanager
 def _worker_surroundings() -> Iterator[None]:
-    """Set what processes started meanwhile inherit: one BLAS thread, and no interrupt key."""
+    """Set what processes started meanwhile inherit: one BLAS thread, no interrupt key and no hangup."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    resource_tracker.ensure_running()  # its own start would lift the mask
     try:
-        with _no_interrupt():
+        with _undisturbed():
             yield
     finally:
         for name, value in before.items():
@@ -61,9 +62,9 @@ def _worker_surroundings() -> Iterator[None]:
 
 
 @contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Hold the interrupt key back; processes that are started meanwhile never get it."""
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _undisturbed() -> Iterator[None]:
+    """Hold back what a terminal sends to all processes; those that are started meanwhile never get it."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
     finally:

@@ -43,7 +43,7 @@ class Waters:
     plan: Plan = field(default_factory=Plan, metadata={"doc": "the planned voyage"})
     ins: Grade = field(default_factory=Grade, metadata={"doc": "the INS"})
     period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
-    noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", above=0.0, high=1000.0)
+    noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", low=1e-3, high=1000.0)
     initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
     digests: str = field(default="", metadata={"doc": "SHA-256 of the files"})
 
@@ -52,6 +52,11 @@ class Waters:
         check(self)
         if self.period != round(self.period):
             raise ConfigError(f"period: {self.period:g} s; expected whole seconds")
+        if not self.voyage and self.plan.seconds < self.period:
+            raise ConfigError(
+                f"plan: {self.plan.seconds} s from filtered to hours; expected at least one period, {self.period:g} s, "
+                "for two measurements"
+            )
 
     def files(self) -> list[str]:
         """Return the files that are read: map and voyage, as far as they are none of ours."""
@@ -96,6 +101,18 @@ class Waters:
             gravity_map, self.plan, grade, runs=runs, seed=seed,
             period=self.period, noise=self.noise, initial=self.initial,
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """How often a study runs, and by which random numbers."""
+
+    runs: int = setting(20, "runs", low=1, high=100_000)
+    seed: int = setting(0, "seed of all random numbers", low=0)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -174,12 +191,14 @@ def _entry(item: Any, where: str) -> FilterEntry:
 def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
     """Return an INS whose accelerometers are as good as a calibration says.
 
-    The sigma of D_a by the diagonal of K_a, root mean square over the axes, is the sigma of the bias.
+    The sigma of D_a by the diagonal of K_a, root mean square over the axes, is the sigma of the bias. In gauge `full`
+    the axes may lie anywhere in the body: there it is the diagonal in gauge `lower`.
 
     Raises:
         DataError: the calibration does not determine the biases.
     """
-    sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(calibration.K_a))
+    K = calibration.model.in_gauge("lower").K if calibration.gauge == "full" else calibration.K_a
+    sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(K))
     if calibration.unit == "g":
         sigma = sigma * STANDARD_GRAVITY
     value = float(np.sqrt(np.mean(np.square(sigma)))) / MICRO_G

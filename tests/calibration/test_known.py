@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 import scipy.stats
-from simulated import MEMS, noise
+from simulated import MEMS, noise, rotation
 
+from accelcal_cli.calibration.exporters.base import Target
+from accelcal_cli.calibration.exporters.formats import export
 from accelcal_cli.calibration.pipeline import calibrate
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.tables import engineering
 from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.navigation.error_model import Grade
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge
 from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.studies.voyages import grade_of
 
 G, SIGMA = 9.8, 2e-3
 KNOWN = Settings(g=G, attitudes="known")
@@ -119,6 +125,56 @@ def test_what_cannot_be_used_is_refused(data, settings, message):
 def test_settings_that_do_not_apply_are_refused(changes):
     with pytest.raises(ConfigError, match="does not go with --attitudes known"):
         calibrate(known(), dataclasses.replace(KNOWN, **changes))
+
+
+TURNED = {
+    "axes exchanged": np.eye(3)[[1, 2, 0]],
+    "two axes turned round": np.diag([-1.0, -1.0, 1.0]),
+    "a mean of zero": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    @ np.diag([1.0, 1.0, -1.0]),
+    "anyhow": rotation(5),
+}
+
+
+@pytest.mark.parametrize("turn", TURNED.values(), ids=TURNED)
+def test_how_the_sensor_lies_in_the_body_does_not_matter(turn):
+    """The same sensor in the same attitudes; only what the body frame is called differs."""
+    plain = known()
+    straight = calibrate(plain, KNOWN)
+    found = calibrate(Readings.from_array(plain.output(), reference=G * TWELVE @ turn), KNOWN)
+    np.testing.assert_allclose(found.K_a @ turn.T, straight.K_a, atol=1e-12)
+    np.testing.assert_array_equal(found.nominal_scale, straight.nominal_scale)
+    assert found.cautions == straight.cautions == ()
+    assert found.rms_before == pytest.approx(straight.rms_before)
+    for row, other in zip(engineering(found).rows, engineering(straight).rows, strict=True):
+        np.testing.assert_allclose([row[1], row[2]], [other[1], other[2]], rtol=1e-6)
+    assert grade_of(found, Grade(), "r").accelerometer == pytest.approx(
+        grade_of(straight, Grade(), "r").accelerometer
+    )
+    record = json.loads(export(found, "imucal", Target()).content)
+    np.testing.assert_allclose(np.diagonal(record["K_a"]), np.linalg.norm(MEMS.K, axis=1), rtol=1e-3)
+
+
+def test_a_reference_that_points_down_is_cautioned():
+    plain = known()
+    found = calibrate(Readings.from_array(plain.output(), reference=-G * TWELVE), KNOWN)
+    assert "counts gravity instead of specific force" in found.cautions[0]
+
+
+@pytest.mark.parametrize("value", [0.1, 3.0])
+def test_an_axis_that_does_not_answer_is_named(value):
+    output = known().output().copy()
+    output[:, 1] = value
+    data = Readings.from_array(output, reference=G * TWELVE)
+    with pytest.raises(DataError, match=rf'column "{data.columns[1]}" is {value:g} in every pose'):
+        calibrate(data, KNOWN)
+
+
+def test_axes_that_depend_on_each_other_are_refused():
+    output = known().output().copy()
+    output[:, 1] = output[:, 0]
+    with pytest.raises(DataError, match="depend on each other"):
+        calibrate(Readings.from_array(output, reference=G * TWELVE), KNOWN)
 
 
 def test_a_reference_is_not_used_unasked():

@@ -167,3 +167,19 @@ def test_it_says_what_it_offers():
     assert (problem.lower == -1).all()
     assert (problem.upper == 1).all()
     np.testing.assert_array_equal(problem.units, dpso_box(9).half)
+
+
+def test_a_singular_matrix_is_the_fate_of_its_run_alone():
+    """K with a zero on its diagonal, in a box that reaches so far."""
+    box = dpso_box(9)
+    wide = Box(box.centre, np.where(np.arange(9) == 0, box.centre, box.half))
+    problem = loetters(OUTPUT, G, wide)
+    u = np.zeros((1, 2, 9))
+    u[0, 1, 0] = -1.0
+    with np.errstate(all="ignore"):
+        jacobian = problem.jacobian(u)
+        gradient, hessian = problem.gradient_hessian(u)
+    np.testing.assert_allclose(jacobian[:, :1], problem.jacobian(u[:, :1]), rtol=1e-15)
+    for found in (jacobian, gradient, hessian):
+        assert np.isfinite(found[0, 0]).all()
+        assert not np.isfinite(found[0, 1]).all()

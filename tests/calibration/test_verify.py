@@ -264,3 +264,42 @@ def test_a_warm_sensor_is_the_one_that_it_was():
     found = verify(old, Readings.from_array(shifted, temperature=degrees[24:]))
     assert found.verdict == "changed"
     assert found.differences[7].value == pytest.approx(0.03 / LOWER.K[1, 1], rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (16377.0, "most have 0.00[0-9]*; are they in another unit than its readings, or of another sensor"),
+        (1e9, "most have .*; are they in another unit"),
+        (1e-9, "most have .*; are they in another unit"),
+        (9.80665, "most have (1|0.99)[0-9.]*; they seem to be in g where those of the result are in m/s"),
+        (1e-3, "most have .*; they seem to be in a unit a thousand times as small"),
+    ],
+)
+@pytest.mark.parametrize("u", [poses.turns(), poses.faces()[:2]], ids=["turns", "two poses"])
+def test_readings_in_another_unit_are_refused(factor, told, u):
+    """A sensor without bias, so that readings too small determine nothing at all."""
+    plain = ErrorModel(1670.0 * np.eye(3), np.zeros(3))
+    old = calibrate(readings(TURNS, model=plain, sigma=SIGMA, seed=1), FAST)
+    other = Readings.from_array(new(u, model=plain).output() / factor)
+    with pytest.raises(DataError, match=rf"no pose is near g = 9.8 m/s\^2, {told}"):
+        verify(old, other)
+
+
+def test_an_axis_that_died_is_a_matter_of_the_sensor():
+    output = new().output().copy()
+    output[:, 2] = MEMS.D[2]
+    found = verify(result(), Readings.from_array(output))
+    assert found.verdict != "unchanged"
+    assert found.rms > 0.2 * G
+
+
+def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
+    monkeypatch.setattr("accelcal_cli.calibration.verify.check_unit", lambda *_: None)
+    monkeypatch.setattr("accelcal_cli.calibration.doubts.doubts", lambda *_: ())
+    plain = ErrorModel(1670.0 * np.eye(3), np.zeros(3))
+    old = calibrate(readings(TURNS, model=plain, sigma=SIGMA, seed=1), FAST)
+    found = verify(old, Readings.from_array(new(poses.faces()[:2], model=plain).output() / 1e4))
+    assert found.directions == 0
+    assert found.verdict == "inconclusive"
+    assert "determine 0 of 9 directions" in " ".join(found.reasons)

@@ -262,3 +262,11 @@ def test_cautions_stand_under_the_verdict_and_go_with_the_result(run):
     assert run("export", "noisy.yaml", "--to", "imucal").err.startswith(said)
     assert run("apply", "noisy.yaml", "noisy.csv", "-o", "forces.csv").err.startswith(said)
     assert run("export", "noisy.yaml", "--to", "imucal", "--quiet").err == ""
+
+
+def test_a_search_that_ends_where_nothing_has_a_slope_is_no_fault(run, tmp_path):
+    (tmp_path / "four.csv").write_text("-2,3,1\n0,-2,1\n-1,-2,0\n1,-1,2\n")
+    options = ("--robust", "huber", "--optimizer", "ifoa", "--iterations", "50", "--g", "9.80665")
+    outcome = run("calibrate", "four.csv", *options, "--format", "csv")
+    assert outcome.code == 1
+    assert "verdict,undetermined" in outcome.out

@@ -252,3 +252,9 @@ def test_the_help_says_what_each_command_does_in_a_whole_sentence(run):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_command_can_be_quiet(run, name):
     assert "-q, --quiet" in run(name, "--help").out
+
+
+def test_standard_output_by_its_name_is_what_the_shell_opened(shell, tmp_path):
+    outcome = shell("echo first > out.yaml; accelcal simulate --sensor mems -q -o /dev/stdout >> out.yaml")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert (tmp_path / "out.yaml").read_text().splitlines()[:2] == ["first", "Nx,Ny,Nz"]

@@ -245,3 +245,23 @@ def test_an_interrupt_leaves_nothing_behind(run, table, monkeypatch):
     done = run("fleet", table, "-o", "results/")
     assert (done.code, done.out, done.err) == (130, "", "accelcal: interrupted\n")
     assert sorted(os.listdir(".")) == before
+
+
+def test_a_temperature_column_is_not_used_and_that_is_said(run, table):
+    rows = Path(table).read_text().splitlines()
+    warm = [f"{row},{'temperature' if k == 0 else 20 + k % 12}" for k, row in enumerate(rows)]
+    Path("warm.csv").write_text("\n".join(warm))
+    plain, told = (run("fleet", name, "--format", "csv") for name in (table, "warm.csv"))
+    assert told.out == plain.out
+    note = "Temperature column not used: slopes with temperature go sensor by sensor, with calibrate."
+    assert note not in plain.err
+    assert f"accelcal: {note}\n" in told.err
+
+
+def test_slopes_with_temperature_that_a_file_asks_for_are_refused(run, table):
+    Path("warm.yaml").write_text("temperature: true\n")
+    refused = run("fleet", table, "--config", "warm.yaml")
+    assert refused.code == 2
+    assert refused.err.startswith("accelcal: warm.yaml: temperature: true: a fleet goes without")
+    Path("cold.yaml").write_text("temperature: false\n")
+    assert run("fleet", table, "--config", "cold.yaml").code == 0

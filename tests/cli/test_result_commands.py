@@ -61,9 +61,11 @@ def test_readings_in_another_unit_are_told(run, result, other):
     parts = [",".join(repr(float(cell) / 16384) for cell in row) for row in rows[1:]]
     Path("g.csv").write_text("\n".join([",".join(rows[0]), *parts]))
     outcome = run("verify", result, "g.csv")
-    assert outcome.code == 1
-    assert "Under the result they miss g by 9." in outcome.out
-    assert "another unit than its readings" in outcome.out
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == (
+        "accelcal: g.csv: under the result no pose is near g = 9.80665 m/s^2, most have 0.685; are they in another "
+        "unit than its readings, or of another sensor?\n"
+    )
 
 
 def test_another_sensor_fails(run, result, other, tmp_path):
@@ -176,6 +178,10 @@ def test_parquet_stays_parquet(run, result, log):
     assert run("apply", result, "log.parquet", "-o", "out.parquet").code == 0
     assert run("apply", result, log, "-o", "out.csv").code == 0
     assert pl.read_parquet("out.parquet").equals(pl.read_csv("out.csv"))
+    with open("open.parquet", "wb") as file:
+        os.symlink(f"/dev/fd/{file.fileno()}", "link.parquet")
+        assert run("apply", result, "log.parquet", "-o", "link.parquet").code == 0
+    assert pl.read_parquet("open.parquet").equals(pl.read_csv("out.csv"))
     assert run("apply", result, "log.parquet", "-o", "again.csv").code == 0
     assert pl.read_csv("again.csv").equals(pl.read_csv("out.csv"))
 
@@ -343,6 +349,14 @@ EXPORT = {
         ["result.yaml", "--to", "px4", "--instance", "9", "--driver-scale", "1"],
         ["--instance 9", "0 to 3"],
     ),
+    "driver scale of ros": (
+        ["result.yaml", "--to", "ros", "--driver-scale", "2"],
+        ["--driver-scale: --to ros has no use for it", "px4, ardupilot, kalibr"],
+    ),
+    "instance of numpy": (
+        ["result.yaml", "--to", "numpy", "--instance", "0", "-o", "a.npz"],
+        ["--instance: --to numpy has no use for it"],
+    ),
     "negative instance": (["result.yaml", "--to", "px4", "--instance", "-1"], ["--instance", "-1"]),
     "no folder": (["result.yaml", "--to", "ros", "-o", "no/out.yaml"], ["no/out.yaml", "no such folder"]),
 }
@@ -394,6 +408,19 @@ def test_every_command_refuses_a_bad_result(run, folder):
         ):
             refused(run(*command), parts)
             assert sorted(os.listdir(folder)) == before, what
+
+
+def test_a_matrix_that_is_all_but_singular_is_no_fault(run, folder):
+    text = Path("result.yaml").read_text()
+    matrix = load_result("result.yaml").K_a
+    flat = matrix.copy()
+    flat[2] = matrix[1] + 1e-6 * matrix[2] / 1e3
+    lines = text.splitlines(keepends=True)
+    start, end = (next(k for k, line in enumerate(lines) if line.startswith(key)) for key in ("K_a:", "D_a:"))
+    Path("flat.yaml").write_text("".join([*lines[:start], f"K_a: {flat.tolist()}\n", *lines[end:]]))
+    for arguments in (("report", "flat.yaml", "-o", "flat.html"), ("export", "flat.yaml", "--to", "kalibr")):
+        outcome = run(*arguments)
+        assert outcome.code == 0, outcome.err
 
 
 @pytest.mark.parametrize(
@@ -457,22 +484,50 @@ def test_a_reader_that_leaves_is_no_error(shell, result, long_log):
     assert outcome.out.splitlines()[0] == "t,ax,ay,az,fx,fy,fz"
 
 
-def test_an_interrupt_is_one_line_and_leaves_no_file(environment, result, long_log, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, b"interrupted"),
+        (signal.SIGHUP, 129, b"ended by SIGHUP"),
+        (signal.SIGTERM, 143, b"ended by SIGTERM"),
+    ],
+)
+def test_an_interrupt_is_one_line_and_leaves_no_file(
+    environment, result, long_log, tmp_path, number, code, said
+):
     before = sorted(os.listdir(tmp_path))
+    program = _busy(environment, result, long_log, tmp_path)
+    program.send_signal(number)
+    out, error = program.communicate()
+    assert (program.returncode, out, error) == (code, b"", b"accelcal: %s\n" % said)
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+def test_a_hangup_that_is_ignored_as_nohup_has_it_ends_nothing(environment, result, long_log, tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        program = _busy(environment, result, long_log, tmp_path)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    program.send_signal(signal.SIGHUP)
+    program.communicate()
+    assert program.returncode == 0
+    assert (tmp_path / "out.csv").is_file()
+
+
+def _busy(environment, result, long_log, folder):
+    """Start `apply` and return it at work: when the pipe has taken the log, it is."""
     program = subprocess.Popen(
         [sys.executable, "-m", "accelcal_cli", "apply", result, "-", "-o", "out.csv"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        cwd=tmp_path,
+        cwd=folder,
         env=environment,
     )
-    program.stdin.write((tmp_path / long_log).read_bytes())  # when the pipe has taken it, it is at work
+    program.stdin.write((folder / long_log).read_bytes())
     program.stdin.flush()
-    program.send_signal(signal.SIGINT)
-    out, error = program.communicate()
-    assert (program.returncode, out, error) == (130, b"", b"accelcal: interrupted\n")
-    assert sorted(os.listdir(tmp_path)) == before
+    return program
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc to read the peak memory from")

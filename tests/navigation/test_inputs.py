@@ -271,8 +271,9 @@ def test_jobs_do_not_change_the_result(quick):
     assert alone["rmse_position_m"] == together["rmse_position_m"]
 
 
-def test_a_calibration_changes_the_ins(quick, tmp_path):
-    result = tmp_path / "result.yaml"
+@pytest.mark.parametrize("suffix", ["yaml", "json"])
+def test_a_calibration_changes_the_ins(quick, tmp_path, suffix):
+    result = tmp_path / f"result.{suffix}"
     subprocess.run(
         f"{sys.executable} -m accelcal_cli simulate --positions 24 --noise 1e-4 | "
         f"{sys.executable} -m accelcal_cli calibrate - --g 9.80665 -q -o {result}",
@@ -296,6 +297,12 @@ def test_a_calibration_changes_the_ins(quick, tmp_path):
     assert rows[0]["accelerometer_ug"] == 50.0
     assert 0 < rows[1]["accelerometer_ug"] < 50.0
     assert rows[1]["bound_m"] < rows[0]["bound_m"]
+    piped = subprocess.run(
+        f"{sys.executable} -m accelcal_cli navigate --config {quick} --calibration - --filter reference --runs 2 "
+        f"--format json -q < {result}",
+        shell=True, check=True, capture_output=True, cwd=ROOT,
+    )  # fmt: skip
+    assert json.loads(piped.stdout)[1]["accelerometer_ug"] == rows[1]["accelerometer_ug"]
 
 
 @pytest.mark.parametrize(
@@ -315,6 +322,47 @@ def test_a_calibration_changes_the_ins(quick, tmp_path):
 )
 def test_bad_usage_is_one_message(arguments, told):
     assert told in navigate(*arguments, code=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("runs: 0", "runs: 0 is too small; expected at least 1"),
+        ("runs: -3", "runs: -3 is too small; expected at least 1"),
+        ("seed: -3", "seed: -3 is too small; expected at least 0"),
+        (
+            "plan: {hours: 0.0001, filtered: 0}",
+            "plan: 0 s from filtered to hours; expected at least one period, 10 s",
+        ),
+        ("plan: {hours: 2.0025}", "plan: 9 s from filtered to hours"),
+        ("noise: 1.0e-300", "noise: 1e-300 is too small; expected at least 0.001"),
+    ],
+)
+def test_a_bad_key_of_the_file_is_one_message(tmp_path, text, told):
+    path = tmp_path / "study.yaml"
+    path.write_text(f"filters: [{{filter: pf}}]\n{text}\n")
+    assert f"{path}: {told}" in navigate("--config", path, code=2)
+
+
+def test_two_measurements_are_enough_for_every_filter(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text("plan: {hours: 2.0028}\nruns: 1\nnoise: 1.0e-3\n")
+    assert len(json.loads(navigate("--config", path, "--format", "json", "-q"))) == len(FILTERS.names())
+
+
+def test_a_filter_that_loses_every_hypothesis_has_diverged(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text("runs: 2\nnoise: 1.0e-3\n")  # a gravimeter that the map is far too coarse for
+    (row,) = json.loads(navigate("--config", path, "--filter", "reference", "--format", "json", "-q"))
+    assert row["diverged"] == 2
+
+
+def test_a_voyage_of_one_measurement_is_refused(tmp_path):
+    path = tmp_path / "voyage.csv"
+    path.write_text("time,latitude,longitude,gravity\n0,20,115,1\n10,20,115,2\n20,20,115,3\n")
+    assert "3 rows, 10 s apart, hold one measurement at --period 30; expected two" in navigate(
+        "--voyage", path, "--period", 30, code=2
+    )
 
 
 def test_a_map_that_ends_inside_the_track_is_refused(tmp_path):

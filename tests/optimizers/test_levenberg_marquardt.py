@@ -157,3 +157,25 @@ def test_it_stops_when_nothing_is_left_to_gain():
     run = _ours(problem, _starts(problem, 3, 0.3))
     assert (run.iterations < 100).all()
     assert (run.cost < 1e-15).all()
+
+
+class Flat(Decay):
+    """Decay samples whose residuals do not change with anything where c is negative."""
+
+    def residuals(self, x):
+        return np.where(x[..., 2:] < 0, 1.0, super().residuals(x))
+
+    def jacobian(self, x):
+        return np.where(x[..., 2:, None] < 0, 0.0, super().jacobian(x))
+
+
+def test_a_run_without_a_slope_fails_alone():
+    starts = np.array([[2.0, 1.0, 0.5], [2.0, 1.0, -0.5], [3.0, 1.0, 0.5]])
+    problem = Flat()
+    problem.lower, problem.y = np.array([0.5, 0.2, -1.0]), problem.y + 0.8  # the minimum is at c = 0.5
+    run = _ours(problem, starts)
+    assert run.status == (Status.CONVERGED, Status.FAILED, Status.CONVERGED)
+    np.testing.assert_array_equal(run.x[1], starts[1])
+    assert run.cost[1] == 20.0
+    alone = _ours(problem, starts[[2]])
+    np.testing.assert_array_equal(run.x[2], alone.x[0])

@@ -109,3 +109,16 @@ def test_gauges_of_many_matrices_at_once():
     for gauge in GAUGES:
         each = np.stack([to_gauge(K, gauge) for K in many.reshape(-1, 3, 3)]).reshape(many.shape)
         np.testing.assert_allclose(to_gauge(many, gauge), each, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("gauge", ["lower", "upper", "symmetric"])
+def test_a_matrix_that_is_all_but_singular_has_its_gauges(gauge):
+    """K K^T has no digits of the smallest singular value left: its factor would be noise, or none."""
+    K = rotation(1) @ np.diag([1e3, 1.0, 1e-7]) @ rotation(2)
+    found = to_gauge(np.stack([K, np.eye(3), np.diag([1.0, 0.0, 2.0])]), gauge)
+    np.testing.assert_allclose(found[0] @ found[0].T, K @ K.T, atol=1e-9)
+    turn = np.linalg.solve(found[0], K)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-5)
+    np.testing.assert_array_equal(found[0], to_gauge(K, gauge))
+    np.testing.assert_array_equal(found[1], np.eye(3))
+    np.testing.assert_allclose(found[2] @ found[2].T, np.diag([1.0, 0.0, 4.0]))

@@ -54,12 +54,22 @@ def test_labels_and_whole_numbers(tmp_path: Path) -> None:
         ({"ax": [*ROWS[:7, 0], None, *ROWS[8:, 0]]}, 'row 8, column "ax": is empty or nan'),
         ({"ay": [*ROWS[:7, 0], np.inf, *ROWS[8:, 0]]}, 'row 8, column "ay": inf is too large or infinite'),
         ({"az": ["up"] * 1000}, 'column "az": does not hold numbers'),
+        (
+            {"pose": [[1, 2]] * 1000},
+            'column "pose": holds List\\(Int64\\); text or numbers were expected as labels',
+        ),
+        ({"pose": [b"\xff\xfe"] * 1000}, 'column "pose": holds Binary; text or numbers were expected'),
         ({"pose": ["up", None] * 500}, 'row 2, column "pose": is empty'),
     ],
 )
 def test_bad_cells(tmp_path: Path, columns: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError, match=message):
         read_readings(write(tmp_path / "poses.parquet", **columns))
+
+
+def test_bytes_that_are_text_are_labels(tmp_path: Path) -> None:
+    readings = read_readings(write(tmp_path / "poses.parquet", pose=[b"up", b"down"] * 500))
+    assert readings.labels == ("up", "down")
 
 
 def test_no_such_column(tmp_path: Path) -> None:

@@ -234,17 +234,26 @@ def _group(leader: int) -> bool:
     return True
 
 
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, "interrupted"),
+        (signal.SIGHUP, 129, "ended by SIGHUP"),
+        (signal.SIGTERM, 143, "ended by SIGTERM"),
+    ],
+)
 @pytest.mark.parametrize("jobs", ["1", "2"])
-def test_the_interrupt_key_keeps_finished_runs(jobs, tmp_path):
+def test_an_interrupt_keeps_finished_runs(jobs, tmp_path, number, code, said):
     study = program(
         tmp_path, "accelcal_cli", *LINE, "--raw", "raw.csv", "--jobs", jobs, start_new_session=True
     )
     until(lambda: lines(tmp_path / "raw.csv.journal") > 2 or study.poll() is not None)
-    os.killpg(study.pid, signal.SIGINT)  # the terminal sends it to all of them
+    os.killpg(study.pid, number)  # the terminal sends it to all of them
     _, errors = study.communicate(timeout=60)
-    assert study.returncode == 130
-    (message,) = errors.splitlines()
-    assert message.startswith("accelcal: interrupted; ")
+    assert study.returncode == code
+    assert len(errors.splitlines()) == 1, errors
+    message = errors
+    assert message.startswith(f"accelcal: {said}; ")
     assert "--resume" in message
     assert {path.name for path in tmp_path.iterdir()} == {"raw.csv.journal"}
     until(lambda: not _group(study.pid))

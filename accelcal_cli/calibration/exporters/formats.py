@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from accelcal_cli.calibration.exporters import ardupilot, c_header, imucal, kalibr, npz, px4, ros
 from accelcal_cli.calibration.exporters.base import Export, Exporter, Target
 from accelcal_cli.calibration.result import Calibration
@@ -16,6 +18,26 @@ FORMATS: dict[str, Exporter] = {
     "c-header": c_header.export,
     "numpy": npz.export,
 }
+
+
+TARGETED = ("px4", "ardupilot", "kalibr")
+"""Formats that depend on the target: on its driver and the number of the sensor there."""
+
+
+def check_options(name: str, given: Iterable[str]) -> None:
+    """Refuse options on the target that a format has no use for.
+
+    Args:
+        name: one of FORMATS; given: the options that were stated, as `--driver-scale`.
+
+    Raises:
+        UsageError: the format does not depend on them.
+    """
+    for option in given:
+        if name not in TARGETED:
+            raise UsageError(
+                f"{option}: --to {name} has no use for it; the formats that take it are {', '.join(TARGETED)}"
+            )
 
 
 def check_name(name: str) -> str:

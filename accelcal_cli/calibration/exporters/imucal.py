@@ -18,8 +18,11 @@ FORMAT = "2.0.0"
 
 
 def export(result: Calibration, target: Target) -> Export:  # noqa: ARG001  # one signature for all
-    """Return a Ferraris calibration: K_a diagonal, R_a = K_a^-1 times the whole matrix, b_a the bias."""
-    scale = np.diagonal(result.K_a)
+    """Return a Ferraris calibration: K_a diagonal, R_a = K_a^-1 times the whole matrix, b_a the bias.
+
+    In gauge `full` the axes may lie anywhere in the body, and the length of a row is the scale factor.
+    """
+    scale = np.linalg.norm(result.K_a, axis=1) if result.gauge == "full" else np.diagonal(result.K_a)
     record = {
         "cal_type": "Ferraris",
         "_format_version": FORMAT,
