@@ -14,11 +14,14 @@ from accelcal_cli.calibration.lotters import ROWS_COLUMNS
 from accelcal_cli.calibration.quality import design
 from accelcal_cli.streams import Bool, Float, Int
 
-STEPS, SETTLED = 12, 1e-9
-"""Gauss-Newton steps at most, and the part of g below which a step is the last but for its square."""
+STEPS, SETTLED = 12, 1e-6
+"""Gauss-Newton steps at most, and the part of g below which a step is the last: the next would be its square."""
 
 LEAST_ROOM = 1e-8
-"""Least eigenvalue, as a part of their sum, at which the other poses still determine a sensor by themselves."""
+"""The trace of a matrix times that of its inverse is below 1 over this where the other poses determine a sensor."""
+
+RIDGE = 1e-14
+"""Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +78,14 @@ def _linearised(force: Float, weights: Float, g: float, free: Int) -> tuple[Floa
     e = (g * g - np.sum(force * force, axis=2)) / (2.0 * g)
     rows = design(force / g)[..., free]
     normal = (rows * weights[..., None]).swapaxes(1, 2) @ rows
-    known: Bool = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
-    known[known] = np.linalg.eigvalsh(normal[known])[:, 0] > LEAST_ROOM * np.einsum("spp->s", normal[known])
-    cofactor = np.full_like(normal, np.nan)
-    cofactor[known] = np.linalg.inv(normal[known])
-    return e, rows, cofactor
+    size = np.einsum("spp->s", normal)
+    finite = np.isfinite(size)[:, None, None]
+    inverse = np.linalg.inv(
+        np.where(finite, normal + RIDGE * size[:, None, None] * np.eye(len(free)), np.eye(len(free)))
+    )
+    spread = np.einsum("spp->s", inverse) * size
+    known = (spread > 0) & (spread < 1.0 / LEAST_ROOM)
+    return e, rows, np.where(known[:, None, None], inverse, np.nan)
 
 
 def _moved(force: Float, step: Float, g: float) -> Float:
