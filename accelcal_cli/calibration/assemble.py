@@ -1,26 +1,22 @@
-"""From a solution to the record: uncertainty, verdict, residuals, notes."""
+"""From a solution to the record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
 
 from accelcal_cli import __version__
-from accelcal_cli.calibration import quality, sigma
-from accelcal_cli.calibration.cautions import cautions
-from accelcal_cli.calibration.judgement import judge, notes
+from accelcal_cli.calibration.assessment import assess
+from accelcal_cli.calibration.judgement import notes
 from accelcal_cli.calibration.nominal import Start, nominal_before
 from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
-from accelcal_cli.calibration.quality import Observabilities
-from accelcal_cli.calibration.residuals import NO_NOISE, Fit, examine, outliers
+from accelcal_cli.calibration.residuals import Fit
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.calibration.robust import loss_weight, robust_variance
-from accelcal_cli.calibration.scatter import beyond_scatter, explained
-from accelcal_cli.calibration.search import Solution, lower_problem, model_at, to_gain
+from accelcal_cli.calibration.search import Solution, model_at
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.temperature import SLOPES, Slopes
+from accelcal_cli.calibration.sigma import propagate
+from accelcal_cli.calibration.temperature import Slopes
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.readings import Readings
 from accelcal_cli.streams import Float
@@ -38,30 +34,13 @@ def assemble(
     slopes: Slopes | None = None,
 ) -> Calibration:
     """Return the calibration record of a solution; with slopes, `readings` are those at the reference temperature."""
-    g = settings.g
     found = model_at(solution.problem, solution.x)
     shown = found.in_gauge(settings.gauge)
-    nine, point = lower_problem(solution.stated, found)
-    low = ErrorModel(*(a[0] for a in nine.parameters(point)))
-    information = quality.information(nine, point)[0] - (0.0 if slopes is None else slopes.loss)
-    held = None if settings.misalignment else quality.ALIGNED
-    known = Observabilities.of(information[None], np.array([readings.poses]), held)
-    seen = known.one(0)
-    freedom = readings.poses - min(9, solution.problem.unknowns) - (0 if slopes is None else SLOPES)
-    judged = judge(solution, start, information, low, readings.poses, freedom, held)
     centre = start.box.centre[0]
     before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
-    fitted = _fitted(solution, found, seen.cofactor)
-    fit = examine(readings, low, before_model, g, fitted, weights, _robust_weight(solution, settings), held)
-    variance = _variance(readings, settings, solution, low, weights, freedom)
-    covariance = sigma.covariance(known, np.array([variance]), np.array([judged.at_wall]), g)[0]
-    sigma_K, sigma_D = sigma.propagate(shown.K, low.K, covariance, settings.gauge, g)
-    scale_sigma = float(np.sqrt(np.diagonal(covariance)[quality.SCALE]).max()) / g
-    s = float(np.sqrt(variance))
-    ratio, chance = noise = _noise(readings, low, s, freedom)
-    named = tuple(int(j) for j in outliers(fit.poses, readings.poses, freedom))
-    where = [readings.where(j) for j in named]
-    left = 0.0 if settings.polish else to_gain(solution)
+    seen = assess(readings, settings, start, solution, found, before_model, weights, slopes)
+    judged, fit = seen.judged, seen.fit
+    sigma_K, sigma_D = propagate(shown.K, seen.low.K, seen.covariance, settings.gauge, settings.g)
     return Calibration(
         K_a=shown.K,
         D_a=shown.D,
@@ -73,20 +52,17 @@ def assemble(
         verdict=judged.verdict,
         reasons=judged.reasons,
         suggestions=judged.suggestions,
-        cautions=(
-            *readings.cautions,
-            *cautions(settings, solution.agreeing, left, s, scale_sigma, noise, where),
-        ),
+        cautions=seen.cautions,
         cost_search=float(solution.search.cost[solution.best]),
         cost=solution.cost,
         rms=fit.rms,
         rms_before=fit.rms_before,
         before=before,
-        s=s,
-        freedom=freedom,
-        noise_ratio=ratio,
-        noise_chance=chance,
-        covariance=covariance,
+        s=seen.s,
+        freedom=seen.freedom,
+        noise_ratio=seen.noise[0],
+        noise_chance=seen.noise[1],
+        covariance=seen.covariance,
         information=judged.information,
         nominal_scale=np.diagonal(before_model.K).copy(),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
@@ -94,59 +70,17 @@ def assemble(
         evaluations=solution.evaluations,
         runs=settings.runs,
         runs_agreeing=solution.agreeing,
-        poses_fit=_pose_fits(readings, fit, low, judged.sight),
-        outliers=named,
+        poses_fit=_pose_fits(readings, fit, seen.low, judged.sight),
+        outliers=seen.outliers,
         convergence=_curve(solution),
         optimizer=settings.optimizer,
         settings=_settings_record(settings, start),
-        g=g,
+        g=settings.g,
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
         notes=(*readings.notes, *notes(solution, start, settings)),
         version=__version__,
         temperature=None if slopes is None else slopes.temperature,
     )
-
-
-def _variance(
-    readings: Readings,
-    settings: Settings,
-    solution: Solution,
-    low: ErrorModel,
-    weights: Float | None,
-    freedom: int,
-) -> float:
-    """Return s^2 in (m/s^2)^2: sum w e^2 / (J - 9); NaN without degrees of freedom."""
-    if freedom < 1:
-        return float("nan")
-    if solution.noise:
-        return robust_variance(readings, low, settings.g, solution.noise, settings.robust, weights)
-    return solution.cost / (4.0 * settings.g**2) / freedom  # L = sum (2 g e)^2
-
-
-def _fitted(solution: Solution, found: ErrorModel, cofactor: Float) -> Float:
-    """Return (J^T W J)^-1 of the fit, shape (9, 9): with robust weights, which leverages and residuals rest on."""
-    if solution.reweighted_from is None:
-        return cofactor
-    nine, point = lower_problem(solution.problem, found)
-    return quality.Observability.of(quality.information(nine, point)[0], 0).cofactor
-
-
-def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:
-    """Return the weight that the robust fit gave a residual in m/s^2; None when all counted alike."""
-    noise = solution.noise
-    if noise is None or noise <= NO_NOISE * settings.g:
-        return None
-    return lambda e: loss_weight(e / noise, settings.robust)
-
-
-def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple[float | None, float | None]:
-    """Return s over the noise that the scatter within poses predicts, and the chance of so large a ratio."""
-    if readings.scatter is None or readings.count is None:
-        return None, None
-    u = low.specific_force(readings.output())
-    u = u / np.linalg.norm(u, axis=1, keepdims=True)
-    variance = explained(u, readings.scatter, readings.count, np.diagonal(low.K))
-    return beyond_scatter(s, float(np.mean(variance)), freedom)
 
 
 def _pose_fits(readings: Readings, fit: Fit, low: ErrorModel, sight: ErrorModel) -> tuple[PoseFit, ...]:
