@@ -65,6 +65,7 @@ def calibrate_known(readings: Readings, settings: Settings) -> Calibration:
 def _assembled(
     readings: Readings, reference: Float, settings: Settings, weights: Float | None, found: Linear
 ) -> Calibration:
+    """Return the record of a fit of all twelve parameters. Raises DataError where it determines too little."""
     if found.rank < 4:
         raise DataError(
             f"{readings.source}: the known attitudes span {found.rank} of 4 dimensions; turn the sensor to at least "
