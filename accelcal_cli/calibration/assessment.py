@@ -85,7 +85,7 @@ def assess(
     named = tuple(int(j) for j in outliers(fit.poses, poses, freedom))
     where = [readings.where(j) for j in named]
     left = 0.0 if settings.polish else to_gain(solution)
-    said = cautions(settings, solution.agreeing, left, s, scale_sigma, noise, where)
+    said = cautions(settings, solution.agreeing, left, s, freedom, scale_sigma, noise, where)
     return Assessment(low, freedom, s, noise, spread, judged, fit, named, (*readings.cautions, *said))
 
 

@@ -8,12 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from accelcal_cli.calibration.chances import chi_square_chance
 from accelcal_cli.calibration.settings import Settings
 
 MORE_THAN_NOISE, SURELY = 2.0, 1e-3
 """Residuals this many times their noise, and by chance this rarely, are told of."""
 
 MOST_NAMED = 8
+
+FEW = 6
+"""Degrees of freedom up to which poses stand in for each other: of twelve edges, which leave three, opposite ones."""
 
 LARGE = 0.005
 """A noise of one pose above this part of g is told of. Data sheets of MEMS accelerometers state nonlinearities of up to
@@ -41,6 +47,7 @@ def cautions(
     agreeing: int,
     left: float,
     s: float,
+    freedom: int,
     sigma_scale: float,
     noise: tuple[float | None, float | None],
     outlying: Sequence[str],
@@ -50,15 +57,15 @@ def cautions(
     Args:
         settings: of the calibration; agreeing: how many of its searches ended in the best minimum.
         left: the part of the cost that one more step would take off.
-        s: standard deviation of one pose's modulus, in the unit of g; NaN where nothing tells it.
+        s: standard deviation of one pose's modulus, in the unit of g, NaN where nothing tells it; freedom: of it.
         sigma_scale: the largest of a scale factor, as a part of it.
         noise: s over what the scatter within poses predicts, and the chance of so large a ratio; None where nothing
             tells them.
         outlying: the poses that do not fit, by line or label.
     """
     return (
-        *not_fitting(outlying, "or use --robust" if settings.robust == "none" else ""),
-        *large_residuals(s, settings.g),
+        *not_fitting(outlying, freedom, robust=settings.robust == "none"),
+        *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
         *_more_than_noise(*noise),
         *_noise_bias(s, settings.g, sigma_scale),
         *_search(agreeing, settings.runs, left),
@@ -67,26 +74,50 @@ def cautions(
     )
 
 
-def large_residuals(s: float, g: float) -> tuple[str, ...]:
-    """Return a caution of residuals that are large beside g; `s` as in `cautions`."""
-    if not s > LARGE * g:
+def is_large(s: float, g: float, freedom: int) -> bool:
+    """Whether a noise of one pose is beyond LARGE g, and not by the chance of its own estimate (chi-square)."""
+    if freedom < 1 or not s > LARGE * g:
+        return False
+    x = freedom * (s / (LARGE * g)) ** 2
+    return bool(chi_square_chance(np.array([x]), np.array([freedom]))[0] < SURELY)
+
+
+def large_residuals(s: float, g: float, freedom: int, *, aligned: bool = False) -> tuple[str, ...]:
+    """Return a caution of residuals that are large beside g.
+
+    Args:
+        s, g: as in `cautions`; freedom: degrees of freedom of s.
+        aligned: whether the axes were taken as perpendicular, which may be what the residuals say.
+    """
+    if not is_large(s, g, freedom):
         return ()
+    other = ", or its axes are not perpendicular" if aligned else ""
     return (
         f"After calibration one pose errs by {s / g:.2%} of g, where {LARGE:.1%} is much for an accelerometer at rest: "
-        "the sensor moved, the readings are averaged too little, or they are not what they are taken for.",
+        f"the sensor moved, the readings are averaged too little, or they are not what they are taken for{other}.",
     )
 
 
-def not_fitting(outlying: Sequence[str], other: str = "") -> tuple[str, ...]:
-    """Return a caution that names the poses that do not fit, and what can be done but measuring again."""
+def not_fitting(outlying: Sequence[str], freedom: int, *, robust: bool = False) -> tuple[str, ...]:
+    """Return a caution that names the poses that do not fit, and what to do.
+
+    Args:
+        outlying: the poses, by line or label.
+        freedom: degrees of freedom: with few, a sound pose can take the blame of another.
+        robust: whether a robust loss is a way out.
+    """
     if not outlying:
         return ()
+    other = ", or use calibrate --robust" if robust else ""
+    doubt = (
+        " With so few poses one can take the blame of another."
+        if freedom <= FEW and len(outlying) > 1
+        else ""
+    )
     named = ", ".join(outlying[:MOST_NAMED])
     more = f" and {len(outlying) - MOST_NAMED:,} more" if len(outlying) > MOST_NAMED else ""
     again = "it" if len(outlying) == 1 else "them"
-    return (
-        f"Beyond chance off the others: {named}{more}. Measure {again} again{', ' if other else ''}{other}.",
-    )
+    return (f"Beyond chance off the others: {named}{more}. Measure {again} again{other}.{doubt}",)
 
 
 def _more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:

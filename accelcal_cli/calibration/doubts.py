@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.cautions import LARGE, large_residuals, not_fitting
+from accelcal_cli.calibration.cautions import is_large, large_residuals, not_fitting
 from accelcal_cli.calibration.chances import Pair
 from accelcal_cli.calibration.quality import design
 from accelcal_cli.calibration.residuals import (
@@ -34,14 +34,14 @@ def doubts(old: Calibration, pair: Pair, readings: Readings) -> tuple[str, ...]:
     lines = []
     if readings.cautions:
         lines.append("Rows of a log are no poses: what they differ by says nothing of the sensor.")
-    if old.s > LARGE * old.g:
+    if is_large(old.s, old.g, old.freedom):
         lines.append(
             f"One pose of the result itself errs by {old.s / old.g:.2%} of g, which hides any ordinary change: "
             "calibrate anew first."
         )
     variance, freedom = pair.b.variance, pair.b.freedom
     noisier = variance > NOISIER**2 * pair.a.variance and pair.noise_chance() < SURELY
-    if freedom > 0 and (noisier or variance > (LARGE * old.g) ** 2):
+    if freedom > 0 and (noisier or is_large(float(np.sqrt(variance)), old.g, freedom)):
         lines.append(
             "A change that the result would show is hidden in the noise of the new readings: measure again with the "
             "care of the calibration, each pose at rest and averaged."
@@ -60,8 +60,8 @@ def cautions(old: Calibration, found: Shift, pair: Pair, readings: Readings, ver
         off = sorted({*off, *_few_off(old, readings)})
     return (
         *readings.cautions,
-        *large_residuals(s, old.g),
-        *not_fitting([readings.where(j) for j in off]),
+        *large_residuals(s, old.g, pair.b.freedom),
+        *not_fitting([readings.where(j) for j in off], pair.b.freedom),
     )
 
 

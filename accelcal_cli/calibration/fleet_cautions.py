@@ -39,6 +39,15 @@ def fleet_cautions(
     words = np.full(len(s), "", dtype=object)
     for at in np.flatnonzero(suspect).tolist():
         noise = beyond_scatter(float(s[at]), float(fits.explained[at]), int(batch.count[at]) - 9)
-        own = cautions(settings, 1, 0.0, float(s[at]), float(sigma[at]), noise, fits.outlying[at])
+        own = cautions(
+            settings,
+            1,
+            0.0,
+            float(s[at]),
+            int(batch.count[at]) - 9,
+            float(sigma[at]),
+            noise,
+            fits.outlying[at],
+        )
         words[at] = " ".join((*readings.cautions(batch, at), *own))
     return words

@@ -13,16 +13,13 @@ from accelcal_cli.calibration.search import Solution, lower_problem, model_at
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.verdict import FEWEST_POSES, edge_names, final_verdict, reasons_of
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.poses import describe
+from accelcal_cli.sensor.poses import describe, faces
 from accelcal_cli.streams import Bool, Float
 
 COMFORTABLE = 5.0
 """Suggested poses bring every dilution of precision to this: half of what counts as weak."""
 
 MOST_SUGGESTIONS = 8
-
-CERTAIN = 1e6
-"""Information, in poses, that stands for knowing a parameter when poses are suggested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +64,7 @@ def judge(
     """
     seen = Observability.of(information, poses, held)
     said, first, sight = _first_sight(solution, start, information, seen, low, poses, held)
-    suggestions = _suggest(said if held is None else said + CERTAIN * np.diag(held), first, poses)
+    suggestions = _suggest(said, first, poses, held)
     edge = edge_names(solution.x[0])
     verdict = final_verdict(seen.verdict, bool(edge), freedom)
     return Judgement(
@@ -104,14 +101,15 @@ def _first_sight(
     return (said, first, sphere) if first.verdict == "undetermined" else (information, seen, low)
 
 
-def _suggest(information: Float, seen: Observability, poses: int) -> tuple[str, ...]:
+def _suggest(information: Float, seen: Observability, poses: int, held: Bool | None) -> tuple[str, ...]:
     if seen.verdict == "good":
         return ()
     from accelcal_cli.calibration.planner import fixture_directions, next_poses
 
-    candidates = fixture_directions()
-    chosen = next_poses(information, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
-    return tuple(describe(candidates[i]) for i in chosen)
+    candidates = fixture_directions() if held is None else faces()
+    known = information if held is None else quality.knowing(information, held)
+    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
+    return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
 
 
 def notes(solution: Solution, start: Start, settings: Settings) -> tuple[str, ...]:

@@ -102,8 +102,8 @@ def _assembled(
         suggestions=(),
         cautions=(
             *readings.cautions,
-            *not_fitting([readings.where(j) for j in named]),
-            *large_residuals(found.s, g),
+            *not_fitting([readings.where(j) for j in named], found.freedom),
+            *large_residuals(found.s, g, found.freedom),
             *_turned_round(model),
         ),
         cost_search=cost,

@@ -44,7 +44,7 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
         readings = noted(
             readings, "The columns of a reference specific force are used with --attitudes known only."
         )
-    if readings.temperature is None or not settings.temperature or not settings.misalignment:
+    if readings.temperature is None or not settings.temperature:
         return assemble(readings, settings, start, solution, weights)
     slopes, note = _slopes(readings, solution, settings, weights)
     if slopes is None:
@@ -65,4 +65,9 @@ def _slopes(
     """Return the slopes with temperature, if the readings determine them, and a sentence about it."""
     if settings.robust != "none":
         return None, "Temperature column not used: slopes with temperature go with plain least squares only."
+    if not settings.misalignment:
+        return (
+            None,
+            "Temperature column not used: slopes with temperature are fitted beside misalignments only.",
+        )
     return fit(readings, model_at(solution.problem, solution.x), settings.g, weights)

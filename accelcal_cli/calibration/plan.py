@@ -80,10 +80,11 @@ def plan(
         so_far: the calibration of the poses so far, whose verdict the plan carries on.
     """
     allowed = candidates(fixture)
-    directions = allowed[best_poses(information, allowed, count)]
+    held = np.zeros(9, dtype=bool) if so_far is None else so_far.held
+    directions = allowed[best_poses(quality.knowing(information, held), allowed, count)]
     rows = design(directions)
     sums = [information + rows[:k].T @ rows[:k] for k in range(count + 1)]
-    seen = tuple(Observability.of(total, poses + k) for k, total in enumerate(sums))
+    seen = tuple(Observability.of(total, poses + k, held) for k, total in enumerate(sums))
     return Plan(poses, directions, seen, noise, so_far)
 
 
@@ -144,20 +145,24 @@ def record(found: Plan) -> dict[str, object]:
     }
 
 
+ALIGNED_NOTE = "Planned for scale factors and biases alone, as the poses so far were calibrated."
+
+
 def _notes(found: Plan) -> tuple[str, ...]:
     if found.beyond_poses:
         return (
             "More poses do not mend the verdict on those so far; the plan only tells what they would add.",
         )
     if found.verdict != "undetermined":
-        return ()
+        return (ALIGNED_NOTE,) if found.so_far is not None and found.so_far.held.any() else ()
     lost = found.seen[-1].above(quality.UNDETERMINED)
     named = ", ".join(lost) if 0 < len(lost) < len(PARAMETERS) else "all nine parameters"
     return (f"Still not determined after these poses: {named}. Plan more poses, or another fixture.",)
 
 
 def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    """Return a dilution of precision; None where it is infinite, or 0 for a parameter that is not estimated."""
+    return value if np.isfinite(value) and value > 0 else None
 
 
 def _times(dop: float | None, noise: float | None, size: float) -> float | None:

@@ -57,6 +57,16 @@ def verdict_of(worst: float, rank: int) -> Verdict:
     return "weak" if worst > WEAK else "good"
 
 
+CERTAIN = 1e6
+"""Information, in poses, that stands for knowing a parameter."""
+
+
+def knowing(information: Float, held: Bool) -> Float:
+    """Return information, shape (9, 9), to which that of knowing some parameters, shape (9,), is added."""
+    known: Float = information + CERTAIN * np.diag(held.astype(float))
+    return known
+
+
 PRIOR = 1e-6
 """Information that physics lends to every parameter when it comes to naming the undetermined ones: none is off by
 more than 1000 times the noise of a pose. Without it a direction that the poses say nothing of would take every

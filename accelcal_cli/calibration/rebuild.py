@@ -30,6 +30,8 @@ SHAPES = {
 WHOLE = ("K_a", "D_a", "K_A", "f_0", "information")
 """Arrays in which a missing number is a fault of the file."""
 
+SENTENCES = ("reasons", "suggestions", "cautions", "notes")
+
 CHOICES = {"gauge": GAUGES, "verdict": get_args(Verdict)}
 NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
 
@@ -71,6 +73,9 @@ def _rebuild(name: str, value: Any) -> Any:
         return _matrix(name, value)
     if name in KINDS:
         records.of_kind(value, *KINDS[name])
+    if name in SENTENCES:
+        for entry in value:
+            records.of_kind(entry, (str,), "text")
     if name == "sigma":
         return Sigma(records.array(value["K_a"], (3, 3)), records.array(value["D_a"], (3,)))
     if name in CHOICES and value not in CHOICES[name]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
 
 BAD_VERDICT = 1
+FACES = 6
+"""Poses at least of a log without --min-poses when no misalignment is asked for."""
 SUFFIXES = (".yaml", ".yml", ".json")
 """Endings of a result file; they choose its form."""
 
@@ -138,7 +140,9 @@ def command(
     if not raw and chosen:
         raise UsageError(f"--{next(iter(chosen)).replace('_', '-')}: goes with --raw only")
     if raw and (config is None or "weights" not in load_mapping(config)):
-        stated.setdefault("weights", "auto")
+        stated.setdefault("weights", "n" if misalignment is False else "auto")
+    if raw and misalignment is False:
+        chosen.setdefault("min_poses", FACES)
     stated["parameters"] = {k: v for k, v in parameters.items() if v is not None}
     settings = load_settings(config, stated)
     if raw:
@@ -181,7 +185,7 @@ def _check_output(output: str | None, format: str) -> None:
         return
     from accelcal_cli.output.files import check_target
 
-    if Path(output).suffix not in SUFFIXES and not Path(output).is_dir():
+    if Path(output).suffix not in SUFFIXES and not options.is_stream(output) and not Path(output).is_dir():
         raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
     check_target(output)
 

@@ -32,7 +32,8 @@ def command(
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.output.report import check_packages, page
 
-    if output != "-" and Path(output).suffix not in SUFFIXES and not Path(output).is_dir():
+    named = Path(output).suffix in SUFFIXES or Path(output).is_dir()
+    if output != "-" and not named and not options.is_stream(output):
         raise UsageError(f'-o "{output}": expected a name that ends in {" or ".join(SUFFIXES)}')
     options.check_apart([result], {"-o": output})
     check_target(output)

@@ -82,7 +82,9 @@ class Collector:
         """Check the poses and return what came with them; `store` and `extent` then speak of poses."""
         extras = self._by_row() if self._means is None else self._by_label(self._means)
         if self.store.rows < 2:
-            raise DataError(f"{self.source}: holds {self._few()}; a calibration needs at least nine poses")
+            raise DataError(
+                f"{self.source}: holds {self._few()}; turn the sensor between readings, best to twelve poses or more"
+            )
         if self.extent.stuck:
             raise DataError(
                 f"{self.source}: all {self.store.rows:,} readings are equal, {self._value()}; "

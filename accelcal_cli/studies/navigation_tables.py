@@ -104,8 +104,10 @@ def _note(study: Navigation, cell: int, records: Sequence[Record]) -> str:
     if not lost + diverged:
         return ""
     names = study.names(cell)
+    ins = f", {float(names['accelerometer_ug']):.3g} micro-g" if len(study.grades) > 1 else ""
+    runs = f"{len(records)} run{'s' * (len(records) != 1)}"
     return (
-        f"{names['filter']} ({names['mode']}): of {len(records)} runs {diverged} diverged and {lost} lost "
+        f"{names['filter']} ({names['mode']}{ins}): of {runs} {diverged} diverged and {lost} lost "
         "lock; their errors are in the row."
     )
 

@@ -203,5 +203,7 @@ def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
         sigma = sigma * STANDARD_GRAVITY
     value = float(np.sqrt(np.mean(np.square(sigma)))) / MICRO_G
     if not math.isfinite(value) or value <= 0:
-        raise DataError(f"{where}: the calibration does not determine the biases ({calibration.verdict})")
+        raise DataError(
+            f"{where}: the calibration states no sigma of the biases (verdict {calibration.verdict})"
+        )
     return replace(grade, accelerometer=value)

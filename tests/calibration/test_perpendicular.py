@@ -9,8 +9,11 @@ import pytest
 from scipy.optimize import least_squares
 from simulated import DPSO, noise
 
+from accelcal_cli.calibration.exporters.base import Target
+from accelcal_cli.calibration.exporters.formats import export
 from accelcal_cli.calibration.fleet import check_settings
 from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.plan import plan, pose_table
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.tables import tables
@@ -105,3 +108,32 @@ def test_fleet_and_verify_want_misalignments():
         check_settings(SIX)
     with pytest.raises(DataError, match="took its axes as perpendicular"):
         verify(calibrate(read(poses.turns(), sigma=1e-2), SIX), read(poses.turns(), sigma=1e-2, seed=2))
+
+
+def test_more_faces_are_suggested_and_planned():
+    """Nothing but faces is needed; and a plan goes on with the model of the result."""
+    first = calibrate(read(poses.faces()[:3]), SIX)
+    assert first.suggestions
+    assert all(len(suggestion.split()) == 2 for suggestion in first.suggestions)
+    assert len(set(first.suggestions)) == len(first.suggestions)
+    result = calibrate(read(np.repeat(poses.faces(), 2, axis=0), sigma=1e-2), SIX)
+    found = plan(result.information, result.poses, 6, "faces", 1e-3, result)
+    assert found.verdict == "good"
+    last = pose_table(found).records()[-1]
+    assert last["dop_scale"] == pytest.approx(np.sqrt(1 / 6), rel=0.02)
+    assert "dop_misalignment" not in last
+    assert "scale factors and biases alone" in pose_table(found).notes[-1]
+
+
+def test_a_temperature_column_is_said_to_be_left():
+    rows = ALIGNED.output(G * poses.turns() + noise(24, 1e-2, 1))
+    data = Readings.from_array(rows, temperature=np.linspace(10.0, 40.0, 24))
+    assert any("Temperature column not used" in note for note in calibrate(data, SIX).notes)
+
+
+def test_nothing_is_dropped_that_was_not_estimated():
+    result = calibrate(read(poses.turns(), sigma=1e-2), SIX)
+    scale = float(np.diagonal(result.K_a).mean())
+    for name in ("px4", "ardupilot"):
+        made = export(result, name, Target(driver_scale=scale))
+        assert not any("misalignments" in warning for warning in made.warnings)

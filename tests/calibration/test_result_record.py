@@ -192,3 +192,12 @@ def test_what_comes_back_can_be_used():
     again = Calibration.from_record(json.loads(json.dumps(result.record())), "r")
     f = again.model.specific_force(readings(poses.turns(), sigma=1e-3).output())
     assert np.sqrt(np.mean((np.linalg.norm(f, axis=1) - G) ** 2)) == pytest.approx(result.rms, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["reasons", "suggestions", "cautions", "notes"])
+@pytest.mark.parametrize("entry", [1, None, ["a"]])
+def test_sentences_are_text(name, entry):
+    record = _result("good").record()
+    record[name] = ["One.", entry]
+    with pytest.raises(DataError, match=f"r: not a calibration result: {name}: .* where text was expected"):
+        Calibration.from_record(record, "r")

@@ -83,7 +83,7 @@ CALIBRATE = {
     "two columns": (["good.csv", "--columns", "1,2"], ["--columns", "three columns", "not 2"]),
     "one column twice": (["good.csv", "--columns", "1,2,1"], ["--columns", "twice"]),
     "all equal": (["equal.csv"], ["equal.csv", "20 readings are equal", "(1, 2, 3)"]),
-    "one pose": (["one.csv"], ["one.csv", "only one pose", "at least nine"]),
+    "one pose": (["one.csv"], ["one.csv", "only one pose", "twelve poses"]),
     "not UTF-8": (["latin.csv"], ["latin.csv, line 3", "UTF-8"]),
     "binary": (["zeros.csv"], ["zeros.csv, line 1", "binary"]),
     "compressed": (["packed.csv"], ["packed.csv", "gzip"]),

@@ -28,7 +28,7 @@ def export(result: Calibration, target: Target) -> Export:
         )
     model = base.in_metres(result, target, "ardupilot")
     scale = 1.0 / np.diagonal(model.K)
-    warnings = [base.dropped(model, result), *base.without_temperature(result)]
+    warnings = [*base.dropped(model, result), *base.without_temperature(result)]
     if np.abs(model.D).max() > LARGEST_OFFSET or scale.min() < SCALES[0] or scale.max() > SCALES[1]:
         warnings.append(
             f"ArduPilot expects offsets up to {LARGEST_OFFSET:g} m/s^2 and scales of {SCALES[0]:g} to {SCALES[1]:g}"

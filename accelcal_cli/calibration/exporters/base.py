@@ -97,8 +97,10 @@ def in_metres(result: Calibration, target: Target, name: str) -> ErrorModel:
     return ErrorModel(result.K_a, result.D_a * metres)
 
 
-def dropped(model: ErrorModel, result: Calibration) -> str:
-    """Return a sentence on the misalignments that a diagonal format leaves out, in mrad and as force at 1 g."""
+def dropped(model: ErrorModel, result: Calibration) -> tuple[str, ...]:
+    """Return a sentence on the misalignments that a diagonal format leaves out, in mrad and as force at 1 g, if any."""
+    if result.held.any():
+        return ()
     rest = model.K / np.diagonal(model.K)[:, None] - np.eye(3)
     i, j = np.unravel_index(int(np.abs(rest).argmax()), (3, 3))
     angle = abs(float(rest[i, j]))
@@ -106,7 +108,7 @@ def dropped(model: ErrorModel, result: Calibration) -> str:
     error = metres * float(np.linalg.norm(rest, 2))
     return (
         f"this format has no misalignments: up to {angle * MRAD:.3g} mrad ({angle:.3f} rad, axis {AXES[i]} towards "
-        f"{AXES[j]}) are dropped, an error of up to {error:.2g} m/s^2 at 1 g"
+        f"{AXES[j]}) are dropped, an error of up to {error:.2g} m/s^2 at 1 g",
     )
 
 

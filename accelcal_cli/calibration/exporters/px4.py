@@ -23,16 +23,16 @@ def export(result: Calibration, target: Target) -> Export:
     if target.instance >= SENSORS:
         raise UsageError(f"--instance {target.instance}: PX4 has accelerometers 0 to {SENSORS - 1}")
     model = base.in_metres(result, target, "px4")
-    warning = base.dropped(model, result)
+    warnings = (*base.dropped(model, result), *base.without_temperature(result))
     name = f"CAL_ACC{target.instance}"
     said = [
         *base.origin(result),
         "PX4: corrected = (reading - OFF) * SCALE, m/s^2, in the axes of the sensor.",
         f"{name}_ID has to be the device that the readings came from.",
-        f"Warning: {warning}.",
+        *(f"Warning: {warning}." for warning in warnings),
         "Vehicle-Id Component-Id Name Value Type",
     ]
     values = [(f"{axis.upper()}OFF", model.D[i]) for i, axis in enumerate(AXES)]
     values += [(f"{axis.upper()}SCALE", 1.0 / np.diagonal(model.K)[i]) for i, axis in enumerate(AXES)]
     lines = "".join(f"1\t1\t{name}_{key}\t{value:.9g}\t{REAL32}\n" for key, value in values)
-    return Export((base.comment(said) + lines).encode(), (warning, *base.without_temperature(result)))
+    return Export((base.comment(said) + lines).encode(), warnings)
