@@ -17,6 +17,7 @@ MORE_THAN_NOISE, SURELY = 2.0, 1e-3
 """Residuals this many times their noise, and by chance this rarely, are told of."""
 
 MOST_NAMED = 8
+"""Poses that one caution names."""
 
 FEW = 6
 """Degrees of freedom up to which poses stand in for each other: of twelve edges, which leave three, opposite ones."""
