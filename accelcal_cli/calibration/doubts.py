@@ -1,4 +1,4 @@
-"""What keeps a verification from telling: noise that hides a change, and readings that are no poses at rest."""
+"""What keeps a verification from telling: noise that hides a change, and readings that are doubtful themselves."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ def doubts(old: Calibration, pair: Pair, readings: Readings) -> tuple[str, ...]:
     """Return why new readings that show no change do not show that there is none, in sentences."""
     lines = []
     if readings.cautions:
-        lines.append("Rows of a log are no poses: what they differ by says nothing of the sensor.")
+        lines.append(
+            "The new readings are doubtful themselves, as the cautions say: what they differ by says little of the "
+            "sensor."
+        )
     if is_large(old.s, old.g, old.freedom):
         lines.append(
             f"One pose of the result itself errs by {old.s / old.g:.2%} of g, which hides any ordinary change: "

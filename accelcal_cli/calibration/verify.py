@@ -159,7 +159,7 @@ def verify(
 
 
 def _verdict(chance: float, level: float, doubts: tuple[str, ...], readings: Readings) -> str:
-    """Return the verdict; where there are doubts a change has to be certain, and of rows that are no poses none is.
+    """Return the verdict; where there are doubts a change has to be certain, and of doubtful readings none is.
 
     A chance that is no number, for readings that no direction is seen of, says nothing.
     """

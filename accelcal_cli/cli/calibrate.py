@@ -139,10 +139,13 @@ def command(
     )
     if not raw and chosen:
         raise UsageError(f"--{next(iter(chosen)).replace('_', '-')}: goes with --raw only")
-    if raw and (config is None or "weights" not in load_mapping(config)):
-        stated.setdefault("weights", "n" if misalignment is False else "auto")
-    if raw and misalignment is False:
-        chosen.setdefault("min_poses", FACES)
+    if raw:
+        keys = {} if config is None else load_mapping(config)
+        aligned = {**keys, **stated}.get("misalignment") is False
+        if "weights" not in keys:
+            stated.setdefault("weights", "n" if aligned else "auto")
+        if aligned:
+            chosen.setdefault("min_poses", FACES)
     stated["parameters"] = {k: v for k, v in parameters.items() if v is not None}
     settings = load_settings(config, stated)
     if raw:
@@ -183,9 +186,9 @@ def _check_output(output: str | None, format: str) -> None:
         if format != "table":
             raise UsageError(f"-o - prints the result file; leave out --format {format}")
         return
-    from accelcal_cli.output.files import check_target
+    from accelcal_cli.output.files import check_target, is_stream
 
-    if Path(output).suffix not in SUFFIXES and not options.is_stream(output) and not Path(output).is_dir():
+    if Path(output).suffix not in SUFFIXES and not is_stream(output) and not Path(output).is_dir():
         raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
     check_target(output)
 

@@ -115,12 +115,6 @@ def gravity(g: float | None, latitude: float | None, height: float | None) -> fl
     return None if latitude is None else normal_gravity(latitude, height or 0.0)
 
 
-def is_stream(path: str) -> bool:
-    """Whether an output is a pipe or a device, which may have any name."""
-    target = Path(path)
-    return path.startswith("/dev/") or (target.exists() and not (target.is_file() or target.is_dir()))
-
-
 def caution(source: str, cautions: Iterable[str], quiet: bool) -> None:
     """Say on standard error, unless quiet, what speaks against trusting a file."""
     for text in () if quiet else cautions:

@@ -29,11 +29,11 @@ def command(
     links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the verdict is
     "undetermined"; the report is written all the same.
     """
-    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.output.files import check_target, is_stream, whole_file
     from accelcal_cli.output.report import check_packages, page
 
     named = Path(output).suffix in SUFFIXES or Path(output).is_dir()
-    if output != "-" and not named and not options.is_stream(output):
+    if output != "-" and not named and not is_stream(output):
         raise UsageError(f'-o "{output}": expected a name that ends in {" or ".join(SUFFIXES)}')
     options.check_apart([result], {"-o": output})
     check_target(output)

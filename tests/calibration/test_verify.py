@@ -157,7 +157,7 @@ def test_rows_of_a_log_are_no_poses():
     found = verify(result(), Readings.from_array(MEMS.output(G * u + waves)))
     assert found.chance < 1e-9
     assert found.verdict == "inconclusive"
-    assert any("Rows of a log are no poses" in line for line in found.reasons)
+    assert any("doubtful themselves" in line for line in found.reasons)
     assert "6,000 rows are a log" in found.cautions[0]
 
 
@@ -303,3 +303,12 @@ def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
     assert found.directions == 0
     assert found.verdict == "inconclusive"
     assert "determine 0 of 9 directions" in " ".join(found.reasons)
+
+
+def test_copies_are_no_new_readings_and_are_not_called_a_log():
+    """Six poses, each four times to the last digit: the reason speaks of what the cautions say, not of a log."""
+    output = np.repeat(new(poses.edges()[:6]).output(), 4, axis=0)
+    found = verify(result(), Readings.from_array(output))
+    assert found.verdict == "inconclusive"
+    assert any("doubtful themselves, as the cautions say" in reason for reason in found.reasons)
+    assert any("repeat another to the last digit" in caution for caution in found.cautions)

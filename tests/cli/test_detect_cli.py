@@ -275,3 +275,36 @@ def test_a_simulated_log_repeats_from_its_seed(run):
     header, *lines = rows(again[0])
     assert header == ["t", "ax", "ay", "az"]
     assert len(lines) > 3 * 400
+
+
+def test_a_log_of_faces_is_enough_without_misalignments(run):
+    """On the command line or by the configuration: six poses will do, weighed by their number of readings."""
+    run(
+        "simulate",
+        "--raw",
+        "--positions",
+        "6",
+        "--scheme",
+        "faces",
+        "--sensor",
+        "mems",
+        "--seed",
+        "4",
+        "-o",
+        "faces.csv",
+    )
+    Path("six.yaml").write_text("misalignment: false\n")
+    for stated in (["--no-misalignment"], ["--config", "six.yaml"]):
+        done = run(
+            "calibrate",
+            "faces.csv",
+            "--raw",
+            "--optimizer",
+            "levenberg-marquardt",
+            *stated,
+            "--format",
+            "json",
+            "-q",
+        )
+        one = json.loads(done.out)
+        assert (done.code, one["poses"], one["settings"]["weights"]) == (0, 6, "n")
