@@ -93,26 +93,16 @@ def mealpy_pso(objective: Objective) -> Job:
     return lambda: swarm.OriginalPSO(epoch=ITERATIONS, pop_size=POPULATION).solve(task)
 
 
-def fcmaes_de(objective: Objective) -> Job:
-    from fcmaes.decpp import DE_C
+def fcmaes(objective: Objective, name: str) -> Job:
+    from fcmaes import cmaescpp, decpp
     from scipy.optimize import Bounds
 
-    def run() -> None:
-        search = DE_C(D, Bounds(objective.lower, objective.upper), popsize=POPULATION)
-        for _ in range(ITERATIONS):
-            search.tell(objective.rows(np.asarray(search.ask())))
-
-    return run
-
-
-def fcmaes_cma(objective: Objective) -> Job:
-    from fcmaes.cmaescpp import ACMA_C
-    from scipy.optimize import Bounds
+    search = {"de": decpp.DE_C, "cma": cmaescpp.ACMA_C}[name]
 
     def run() -> None:
-        search = ACMA_C(D, Bounds(objective.lower, objective.upper), popsize=POPULATION)
+        found = search(D, Bounds(objective.lower, objective.upper), popsize=POPULATION)
         for _ in range(ITERATIONS):
-            search.tell(objective.rows(np.asarray(search.ask())))
+            found.tell(objective.rows(np.asarray(found.ask())))
 
     return run
 
@@ -171,8 +161,8 @@ PYTHON: dict[str, Callable[[Objective], Job]] = {
     "pygmo pso_gen, batched": partial(pygmo_python, name="pso_gen"),
     "pygmo de, point by point": partial(pygmo_python, name="de"),
     "pygmo cmaes, point by point": partial(pygmo_python, name="cmaes"),
-    "fcmaes DE, ask and tell": fcmaes_de,
-    "fcmaes CMA-ES, ask and tell": fcmaes_cma,
+    "fcmaes DE, ask and tell": partial(fcmaes, name="de"),
+    "fcmaes CMA-ES, ask and tell": partial(fcmaes, name="cma"),
 }
 """Peers that minimise the same function in Python; those of pygmo and fcmaes are themselves C++."""
 
