@@ -2,7 +2,9 @@
 
 The public library, loaded when first used so that `accelcal --help` need not wait for numpy:
 
-    from accelcal_cli import Settings, calibrate, read_readings
+    from accelcal_cli import Settings as Settings
+    from accelcal_cli import calibrate as calibrate
+    from accelcal_cli import read_readings as read_readings
     result = calibrate(read_readings("data.csv"), Settings(g=9.81))
 """
 
@@ -12,18 +14,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.pipeline import calibrate as calibrate
+    from accelcal_cli.calibration.calibrate import calibrate as calibrate
     from accelcal_cli.calibration.result import Calibration as Calibration
     from accelcal_cli.calibration.settings import Settings as Settings
     from accelcal_cli.config import load_sensor as load_sensor
     from accelcal_cli.config import load_settings as load_settings
     from accelcal_cli.errors import AccelcalError as AccelcalError
-    from accelcal_cli.optimizers.base import OPTIMIZERS as OPTIMIZERS
-    from accelcal_cli.optimizers.minimize import minimize as minimize
-    from accelcal_cli.problem import Problem as Problem
+    from accelcal_cli.io.readings import Readings as Readings
+    from accelcal_cli.io.readings import read_readings as read_readings
+    from accelcal_cli.optimization.minimize import minimize as minimize
+    from accelcal_cli.optimization.optimizer import OPTIMIZERS as OPTIMIZERS
+    from accelcal_cli.optimization.problem import Problem as Problem
     from accelcal_cli.sensor.model import ErrorModel as ErrorModel
-    from accelcal_cli.sensor.readings import Readings as Readings
-    from accelcal_cli.sensor.readings import read_readings as read_readings
 
 __version__ = "0.1.0"
 
@@ -31,15 +33,15 @@ _HOMES = {
     "AccelcalError": "errors",
     "Calibration": "calibration.result",
     "ErrorModel": "sensor.model",
-    "OPTIMIZERS": "optimizers.base",
-    "Problem": "problem",
-    "Readings": "sensor.readings",
+    "OPTIMIZERS": "optimization.optimizer",
+    "Problem": "optimization.problem",
+    "Readings": "io.readings",
     "Settings": "calibration.settings",
-    "calibrate": "calibration.pipeline",
+    "calibrate": "calibration.calibrate",
     "load_sensor": "config",
     "load_settings": "config",
-    "minimize": "optimizers.minimize",
-    "read_readings": "sensor.readings",
+    "minimize": "optimization.minimize",
+    "read_readings": "io.readings",
 }
 
 __all__ = ["__version__", *_HOMES]

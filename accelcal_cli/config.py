@@ -14,7 +14,7 @@ import yaml
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.registry import build
+from accelcal_cli.schema import build
 
 if TYPE_CHECKING:
     from accelcal_cli.sensor.simulation import Sensor

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.compress import compress
-from accelcal_cli.calibration.lotters import Box, Loetters, pack
+from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
 from accelcal_cli.config import load_sensor
 from accelcal_cli.sensor.poses import fibonacci
 from accelcal_cli.sensor.simulation import simulate

@@ -13,13 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
-from accelcal_cli.calibration.lotters import pack, unpack
+from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid, pack, unpack
 from accelcal_cli.config import load_sensor
 from accelcal_cli.sensor.poses import faces_edges
 from accelcal_cli.sensor.simulation import simulate_fleet
-from accelcal_cli.streams import Float
 from benchmarks.clock import pairs, process, report
 
 G = 9.80665

@@ -23,8 +23,8 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from accelcal_cli.optimizers.base import OPTIMIZERS
-from accelcal_cli.optimizers.minimize import minimize
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.studies.functions import PAPER, TestFunction
 from benchmarks.peers import ITERATIONS, NATIVE, POPULATION, PYTHON, D, Job, Objective
 

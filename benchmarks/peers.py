@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from accelcal_cli.streams import Float
+from accelcal_cli.arrays import Float
 from accelcal_cli.studies.functions import TestFunction
 
 POPULATION, ITERATIONS, D = 100, 500, 12

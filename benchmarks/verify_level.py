@@ -10,15 +10,16 @@ import sys
 
 import numpy as np
 
-from accelcal_cli.calibration.chances import Noise, Pair, combined
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.quality import design
+from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.distributions import Noise, Pair, combined
+from accelcal_cli.calibration.observability import design
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.verify import verify
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.verification.verify import verify
 
 LEVEL = 0.05
 G, NOISE = 9.80665, 2e-3

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from simulated import DPSO, lower_loetters
 
-from accelcal_cli.problem import Problem
+from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.sensor import poses
 
 G = 9.8

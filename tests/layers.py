@@ -10,11 +10,15 @@ from pathlib import Path
 PACKAGE = "accelcal_cli"
 
 GROUPS = (
-    ("errors", "streams", "registry", "table"),
-    ("problem",),
-    ("sensor", "optimizers"),
-    ("calibration", "navigation"),
-    ("config", "studies"),
+    ("errors", "arrays", "rng", "schema", "registry", "table"),
+    ("optimization", "sensor"),
+    ("io",),
+    ("calibration",),
+    ("detection", "planning", "verification", "exporters"),
+    ("config",),
+    ("studies",),
+    ("navigation",),
+    ("views",),
     ("output",),
     ("cli",),
 )
@@ -22,7 +26,7 @@ GROUPS = (
 
 RANK = {unit: rank for rank, group in enumerate(GROUPS) for unit in group}
 
-SIBLINGS = ("errors", "streams", "registry", "table", "config", "studies")
+SIBLINGS = GROUPS[0]
 """Units that may import others of their own group, as long as no circle comes of it."""
 
 ONLY_IN = {
@@ -36,10 +40,7 @@ ONLY_IN = {
 HEAVY = ("scipy", "polars", "boule", "matplotlib", "dask", "jinja2", "serial")
 """Packages that are imported where they are used, never when a module is loaded."""
 
-LATE = {
-    "sensor/parquet.py": "accelcal_cli.sensor.parquet",
-    "sensor/rewrite_parquet.py": "accelcal_cli.sensor.rewrite_parquet",
-}
+LATE = {"io/parquet.py": "accelcal_cli.io.parquet"}
 """Modules that are nothing without a heavy package: they may load it, and no one may load them early."""
 
 FRONT = ("__init__", "__main__")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.lotters import Box, Loetters
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Streams
 
 DPSO = ErrorModel(
     np.array(

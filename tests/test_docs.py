@@ -27,12 +27,10 @@ import pytest
 import typer.main
 import yaml
 
-from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
-from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
-from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.cli.main import app
-from accelcal_cli.optimizers.base import OPTIMIZERS
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.sensor.simulation import Sensor, Spread
 
 ROOT = Path(__file__).parents[1]
@@ -378,10 +376,10 @@ def optimizer_page(name: str) -> Path:
 
 def sources(module: str) -> set[Path]:
     """Return the file of an optimizer and of those it takes parts from."""
-    folder = ROOT / "accelcal_cli" / "optimizers"
+    folder = ROOT / "accelcal_cli" / "optimization" / "algorithms"
     text = (folder / f"{module}.py").read_text("utf-8")
-    parts = re.findall(r"^from accelcal_cli\.optimizers\.(\w+) import", text, re.MULTILINE)
-    parts += re.findall(r"^from accelcal_cli\.optimizers import (\w+)$", text, re.MULTILINE)
+    parts = re.findall(r"^from accelcal_cli\.optimization\.algorithms\.(\w+) import", text, re.MULTILINE)
+    parts += re.findall(r"^from accelcal_cli\.optimization\.algorithms import (\w+)$", text, re.MULTILINE)
     return {folder / f"{module}.py"}.union(*(sources(part) for part in parts))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from known_problems import Decay, ShiftedSphere
 
-from accelcal_cli.problem import Counted, Problem
+from accelcal_cli.optimization.problem import Counted, Problem
 from accelcal_cli.table import Column, Table
 
 

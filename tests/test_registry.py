@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import AccelcalError, ConfigError, did_you_mean
-from accelcal_cli.optimizers.base import OPTIMIZERS
-from accelcal_cli.registry import Registry, build, check, setting
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.registry import Registry
+from accelcal_cli.schema import build, check, setting
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import accelcal_cli
-from accelcal_cli.streams import Purpose, Streams
+from accelcal_cli.rng import Purpose, Streams
 
 
 @given(
@@ -103,4 +103,4 @@ def test_every_stream_of_the_library_states_its_purpose_by_name():
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "Streams":
                 stated = [*node.args[2:], *(key.value for key in node.keywords)]
                 named = [ast.unparse(purpose).startswith("Purpose.") for purpose in stated]
-                assert named in ([], [True]) or path.name == "streams.py", f"{path}:{node.lineno}"
+                assert named in ([], [True]) or path.name == "rng.py", f"{path}:{node.lineno}"

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimizers.base import OPTIMIZERS, Optimizer
-from accelcal_cli.registry import check, setting
-from accelcal_cli.sensor.model import Gauge
-from accelcal_cli.sensor.units import STANDARD_GRAVITY
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.schema import check, setting
+from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
 Robust = Literal["none", "huber", "soft-l1"]
 Weights = Literal["none", "n", "sd", "auto"]

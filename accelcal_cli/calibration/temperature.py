@@ -8,19 +8,17 @@ brought to T_0 are then those of a plain sensor, and everything else is done wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from accelcal_cli.calibration import record as records
-from accelcal_cli.calibration.lotters import ROWS_COLUMNS
-from accelcal_cli.calibration.quality import RANK_TOLERANCE, WEAK
+from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, WEAK
+from accelcal_cli.calibration.problem import ROWS_COLUMNS
+from accelcal_cli.calibration.result import Temperature
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.stream import RowStore
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.sensor.spool import RowStore
-from accelcal_cli.streams import Float
 
 SMALLEST_RANGE = 5.0
 """Degrees between the coldest and the warmest pose below which slopes would be extrapolated at once."""
@@ -29,52 +27,6 @@ SLOPES = 6
 MOST_POSES = 100_000
 STEPS, SETTLED = 30, 1e-12
 """Gauss-Newton steps at most, and the step, as part of g, that ends them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Temperature:
-    """How a sensor changes with temperature; the other parameters of a result hold at `reference`.
-
-    Attributes:
-        reference: T_0; low, high: of the poses, in the unit of the temperature column.
-        scale: k_i, relative change of the scale factors per degree, shape (3,).
-        bias: b_i, change of the bias per degree, output units, shape (3,).
-        sigma_scale, sigma_bias: their one-sigma, shape (3,).
-        dop: dilution of precision of the slopes, taken as force at half the range, shape (6,).
-    """
-
-    reference: float
-    low: float
-    high: float
-    scale: Float
-    bias: Float
-    sigma_scale: Float
-    sigma_bias: Float
-    dop: Float
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Temperature:
-        """Return the slopes of a record.
-
-        Raises:
-            KeyError, TypeError, ValueError: a part is missing or of another kind.
-        """
-        reference, low, high = (float(record[key]) for key in ("reference", "low", "high"))
-        scale, bias = (records.array(record[key], (3,), whole=True) for key in ("scale", "bias"))
-        sigma_scale, sigma_bias = (records.array(record[key], (3,)) for key in ("sigma_scale", "sigma_bias"))
-        dop = records.array(record["dop"], (6,))
-        return cls(reference, low, high, scale, bias, sigma_scale, sigma_bias, dop)
-
-    def at_reference(self, output: Float, degrees: Float, D: Float) -> Float:
-        """Return readings as they would be at the reference temperature, shape (B, 3).
-
-        Args:
-            output: readings, shape (B, 3); degrees: their temperature, shape (B,).
-            D: D_a at the reference temperature, shape (3,).
-        """
-        t = (degrees - self.reference)[:, None]
-        brought: Float = (output - D - self.bias * t) / (1.0 + self.scale * t) + D
-        return brought
 
 
 @dataclass(frozen=True, eq=False)

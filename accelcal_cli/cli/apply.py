@@ -50,8 +50,8 @@ def command(
     text. The log streams through: memory does not grow with it.
     """
     from accelcal_cli.calibration.apply import Wish, prepare
+    from accelcal_cli.io.reader import open_table
     from accelcal_cli.output.files import check_target, whole_file
-    from accelcal_cli.sensor.tabular import open_table
 
     options.check_input(data)
     options.check_apart([result], {"-o": output})  # the log itself may be the output

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options, running
+from accelcal_cli.cli import options
+from accelcal_cli.cli import options as running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def command(
 
 
 def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.studies.benchmark import curves, summary
 
     rows = summary(study, records)
@@ -109,8 +110,8 @@ def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
-        from accelcal_cli.output.benchmark import show_benchmark
-        from accelcal_cli.studies import ranks
+        from accelcal_cli.output.console import show_benchmark
+        from accelcal_cli.studies import benchmark as ranks
 
         ranking = ranks.rank(study, records)
         further = [ranks.table(ranking)] if ranking else []

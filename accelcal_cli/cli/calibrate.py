@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import detecting, options, pipes
+from accelcal_cli.cli import options
+from accelcal_cli.cli import options as detecting
+from accelcal_cli.cli import process as pipes
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -98,10 +100,10 @@ def command(
     Prints the K matrix and the bias with their uncertainty, how well the poses determine them, and a verdict.
     Exit code 1 means that the verdict is "undetermined" or that --tolerance was missed.
     """
-    from accelcal_cli.calibration.pipeline import calibrate
+    from accelcal_cli.calibration.calibrate import calibrate
     from accelcal_cli.config import load_mapping, load_settings
-    from accelcal_cli.sensor.readings import read_readings
-    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+    from accelcal_cli.io.readings import read_readings
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
     options.check_format(format)
     options.check_input(data)
@@ -195,7 +197,7 @@ def _check_output(output: str | None, format: str) -> None:
 
 def _show(result: Calibration, format: str, output: str | None) -> None:
     """Write the result file, then print the result in the chosen form."""
-    from accelcal_cli.output.plain import json_text, write_csv
+    from accelcal_cli.output.machine import json_text, write_csv
 
     if output is not None:
         from accelcal_cli.config import dump
@@ -209,10 +211,10 @@ def _show(result: Calibration, format: str, output: str | None) -> None:
     if format == "json":
         sys.stdout.write(json_text(result.record()))
     elif format == "csv":
-        from accelcal_cli.calibration.tables import values
+        from accelcal_cli.views.calibration import values
 
         write_csv(values(result), sys.stdout)
     else:
-        from accelcal_cli.output.calibration import show_calibration
+        from accelcal_cli.output.console import show_calibration
 
         show_calibration(result)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options, signals
+from accelcal_cli.cli import options
+from accelcal_cli.cli import process as signals
 from accelcal_cli.errors import AccelcalError, Interrupted, OutputError, UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.output.capture import PoseFile
-    from accelcal_cli.output.live import Watch
-    from accelcal_cli.sensor.capture import Capture
-    from accelcal_cli.streams import Float
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.detection.capture import Capture
+    from accelcal_cli.output.live import PoseFile, Watch
 
 MOST_READINGS = 1_000_000
 INCOMPLETE = 1
@@ -71,8 +71,8 @@ def command(
     of the input and a lost port end it early; the poses taken until then are there. Exit code 1 means that the input
     ended before all poses were taken.
     """
-    from accelcal_cli.calibration.planner import FIXTURES
     from accelcal_cli.output.files import check_target, is_stream
+    from accelcal_cli.planning.design import FIXTURES
 
     if fixture not in FIXTURES[:-1]:
         raise UsageError(f'--fixture "{fixture}": expected one of {", ".join(FIXTURES[:-1])}')
@@ -109,7 +109,7 @@ def _columns(text: str) -> list[int]:
 def _unit(text: str | None) -> float | None:
     if text is None:
         return None
-    from accelcal_cli.sensor.units import OUTPUT_OF_1_G
+    from accelcal_cli.sensor.model import OUTPUT_OF_1_G
 
     try:
         size = OUTPUT_OF_1_G.get(text) or float(text)
@@ -142,9 +142,9 @@ def _capture(
     stated: tuple[float | None, float | None, Float | None],
     unit: str | None,
 ) -> Capture:
-    from accelcal_cli.calibration.planner import candidates, distinct_poses
-    from accelcal_cli.sensor.capture import Capture
-    from accelcal_cli.sensor.units import OUTPUT_OF_1_G
+    from accelcal_cli.detection.capture import Capture
+    from accelcal_cli.planning.design import candidates, distinct_poses
+    from accelcal_cli.sensor.model import OUTPUT_OF_1_G
 
     allowed = candidates(fixture)
     if poses > len(allowed):
@@ -159,7 +159,7 @@ def _capture(
 
 
 def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Iterator[Float]:
-    from accelcal_cli.sensor.lines import file_lines, port_lines, readings
+    from accelcal_cli.io.serial import file_lines, port_lines, readings
 
     lines = file_lines(sys.stdin.buffer) if port == "-" else port_lines(port, baud, timeout)
     return readings(lines, columns, "<stdin>" if port == "-" else port)
@@ -167,8 +167,7 @@ def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Itera
 
 def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) -> None:
     """Watch the readings to the end, whatever it is, and keep the poses; then say how it ended."""
-    from accelcal_cli.output.capture import PoseFile
-    from accelcal_cli.output.live import Watch
+    from accelcal_cli.output.live import PoseFile, Watch
 
     ending: AccelcalError | Interrupted | None = None
     with PoseFile(output) as file:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options, running
+from accelcal_cli.cli import options
+from accelcal_cli.cli import options as running
 from accelcal_cli.cli.simulate import LARGEST_NOISE
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.compare import Comparison
-    from accelcal_cli.studies.scene import Recording, Simulation
+    from accelcal_cli.studies.scenarios import Recording, Simulation
     from accelcal_cli.studies.study import Record
 
 UNKNOWNS = {"lower": 9, "full": 12}
@@ -99,10 +100,10 @@ def command(
     Of simulated sensors, or of readings of a real one. Prints how many runs came to the least cost, what that took,
     and the errors of the parameters; with noise also how near the errors come to the Cramer-Rao bound.
     """
-    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.studies.compare import Comparison
     from accelcal_cli.studies.entries import Budget, choose, words
-    from accelcal_cli.studies.scene import Search
+    from accelcal_cli.studies.scenarios import Search
 
     options.check_format(format)
     type_file = sensor if sensor is not None and Path(sensor).suffix else None
@@ -154,7 +155,7 @@ def _simulated(
 ) -> Simulation:
     from accelcal_cli.config import load_sensor
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.studies.scene import FEWEST, Simulation
+    from accelcal_cli.studies.scenarios import FEWEST, Simulation
 
     if columns is not None:
         raise UsageError("--columns: needs a file of readings")
@@ -171,8 +172,8 @@ def _simulated(
 
 
 def _recorded(data: str, columns: str | None, g: float, simulation: Sequence[str]) -> Recording:
-    from accelcal_cli.sensor.readings import read_readings
-    from accelcal_cli.studies.scene import Recording
+    from accelcal_cli.io.readings import read_readings
+    from accelcal_cli.studies.scenarios import Recording
 
     if simulation:
         raise UsageError(f"{', '.join(simulation)}: not with a file of readings, which are not simulated")
@@ -182,9 +183,8 @@ def _recorded(data: str, columns: str | None, g: float, simulation: Sequence[str
 
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
-    from accelcal_cli.studies.compare import curves
-    from accelcal_cli.studies.outcome import summary
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.studies.compare import curves, summary
 
     rows = summary(study, records)
     if format == "json":
@@ -192,7 +192,7 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
-        from accelcal_cli.output.study import show_study
+        from accelcal_cli.output.console import show_study
 
         plotted: dict[str, Any] = {"Convergence": found} if (found := curves(study, records)) else {}
         show_study(study.subject, [replace(rows.filled(), title="")], plotted, study.conditions)

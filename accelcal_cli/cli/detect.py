@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import detecting, options, running
+from accelcal_cli.cli import options
+from accelcal_cli.cli import options as detecting
+from accelcal_cli.cli import options as running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.detection import Detection
+    from accelcal_cli.detection.detect import Detection
 
 PLOT = "Draw the log with its poses to a .png or .svg file."
 
@@ -45,9 +47,9 @@ def command(
     Prints the poses, and with -o writes them as the CSV file that `calibrate` reads. Several thresholds are tried,
     and the one is kept whose poses calibrate best. `calibrate --raw` does both in one.
     """
-    from accelcal_cli.calibration.detection import TooFewPosesError
+    from accelcal_cli.detection.detect import TooFewPosesError
     from accelcal_cli.output.files import check_target
-    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
     options.check_format(format)
     if output == "-" and format != "table":
@@ -84,7 +86,7 @@ def _draw(found: Detection, plot: str | None, quiet: bool) -> None:
     """Draw the log where a picture is asked for."""
     if plot is None:
         return
-    from accelcal_cli.output.logplot import plot_log
+    from accelcal_cli.output.plot import plot_log
 
     plot_log(found, plot)
     if not quiet:
@@ -93,9 +95,9 @@ def _draw(found: Detection, plot: str | None, quiet: bool) -> None:
 
 def _show(found: Detection, format: str, output: str | None, plot: str | None, quiet: bool) -> None:
     """Write the poses and the picture, then print in the chosen form."""
-    from accelcal_cli.calibration.detected import poses_table, record
     from accelcal_cli.output.files import whole_file
-    from accelcal_cli.output.plain import json_text, write_csv
+    from accelcal_cli.output.machine import json_text, write_csv
+    from accelcal_cli.views.detection import poses_table, record
 
     if output is not None:
         with whole_file(output) as file:
@@ -105,7 +107,7 @@ def _show(found: Detection, format: str, output: str | None, plot: str | None, q
     elif format == "csv":
         write_csv(poses_table(found), sys.stdout)
     elif output != "-":
-        from accelcal_cli.output.detection import show_detection
+        from accelcal_cli.output.console import show_detection
 
         show_detection(found)
     sys.stdout.flush()

@@ -41,8 +41,8 @@ def command(
 
     Warns of what the format cannot hold. PX4 and ArduPilot have no misalignments.
     """
-    from accelcal_cli.calibration.exporters.base import Target
-    from accelcal_cli.calibration.exporters.formats import check_name, check_options, export
+    from accelcal_cli.exporters.base import Target
+    from accelcal_cli.exporters.formats import check_name, check_options, export
     from accelcal_cli.output.files import check_target, whole_file
 
     check_name(to)

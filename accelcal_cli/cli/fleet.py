@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options, pipes
+from accelcal_cli.cli import options
+from accelcal_cli.cli import process as pipes
 from accelcal_cli.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from accelcal_cli.arrays import Bool
     from accelcal_cli.calibration.fleet import Fleet
     from accelcal_cli.calibration.settings import Settings
-    from accelcal_cli.sensor.fleet import FleetReadings
-    from accelcal_cli.streams import Bool
+    from accelcal_cli.io.fleet import FleetReadings
 
 BAD_VERDICT = 1
 SUFFIXES = (".csv", ".parquet", ".json")
@@ -73,8 +74,8 @@ def command(
     """
     from accelcal_cli.calibration.fleet import calibrate_fleet, check_settings
     from accelcal_cli.config import load_mapping, load_settings
-    from accelcal_cli.sensor.fleet_files import read_fleet
-    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+    from accelcal_cli.io.fleet import read_fleet
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
     options.check_format(format)
     for source in data:
@@ -128,8 +129,8 @@ def _check_output(output: str) -> bool:
 def _with_results(readings: FleetReadings, settings: Settings, output: str) -> Fleet:
     """Calibrate, and write the result file of every sensor to a folder."""
     from accelcal_cli.calibration.fleet import calibrate_fleet
+    from accelcal_cli.output.console import write_result
     from accelcal_cli.output.files import whole_folder
-    from accelcal_cli.output.fleet import write_result
 
     with whole_folder(output) as made:
         return calibrate_fleet(
@@ -139,10 +140,10 @@ def _with_results(readings: FleetReadings, settings: Settings, output: str) -> F
 
 def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
-    from accelcal_cli.calibration import fleet_tables
-    from accelcal_cli.calibration.standouts import standouts
-    from accelcal_cli.output import fleet as shown
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+    from accelcal_cli.calibration.fleet import standouts
+    from accelcal_cli.output import console as shown
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.views import fleet as fleet_tables
 
     found = standouts(fleet, settings.g)
     rows = fleet_tables.sensors(fleet, readings.sensors, found)

@@ -16,7 +16,8 @@ import typer.core
 import typer.main
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import pipes, signals
+from accelcal_cli.cli import process as pipes
+from accelcal_cli.cli import process as signals
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options, running
+from accelcal_cli.cli import options
+from accelcal_cli.cli import options as running
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from accelcal_cli.navigation.error_model import Grade
-    from accelcal_cli.studies.navigation import Navigation
+    from accelcal_cli.navigation.ins import Grade
+    from accelcal_cli.navigation.study import FilterEntry, Navigation, Waters
     from accelcal_cli.studies.study import Record
-    from accelcal_cli.studies.voyages import FilterEntry, Waters
 
 MODES = ("default", "literal", "both")
 ALL = "all"
@@ -131,10 +131,9 @@ def _study(
     calibration: str | None,
 ) -> Navigation:
     """Return the study that file and command line state together."""
-    from accelcal_cli.registry import build
+    from accelcal_cli.navigation.study import Navigation, Repeats, load_waters
+    from accelcal_cli.schema import build
     from accelcal_cli.studies.entries import words
-    from accelcal_cli.studies.navigation import Navigation
-    from accelcal_cli.studies.voyages import Repeats, load_waters
 
     waters, own, further = load_waters(config, stated)
     filed: dict[str, Any] = {key: further[key] for key in ("runs", "seed") if key in further}
@@ -151,7 +150,7 @@ def _entries(
     names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, settings: dict[str, Any]
 ) -> list[FilterEntry]:
     """Return the filters by name or label, in the modes that were asked for."""
-    from accelcal_cli.studies.voyages import FilterEntry, filter_names, limited
+    from accelcal_cli.navigation.study import FilterEntry, filter_names, limited
 
     stated = {entry.label: entry for entry in own}
     wanted = list(names) or list(stated) or [ALL]
@@ -168,7 +167,7 @@ def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]
     The accelerometers are strapped down: on a platform an alignment hides their biases. Any drift is taken that the
     filters can start with.
     """
-    from accelcal_cli.studies.voyages import grade_of
+    from accelcal_cli.navigation.study import grade_of
 
     result = options.load_result(source)
     free = replace(waters, plan=replace(waters.plan, drift=(0.0, waters.initial)))
@@ -178,8 +177,8 @@ def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]
 
 def show(study: Navigation, records: Sequence[Record], format: str) -> None:
     """Print the summary in a format; "" prints nothing."""
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
-    from accelcal_cli.studies.navigation_tables import summary
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.views.navigation import summary
 
     rows = summary(study, records)
     if format == "json":
@@ -206,10 +205,9 @@ def reproduce(
     quiet: bool,
 ) -> None:
     """Run a shipped experiment on navigation filters and print it beside the paper's numbers."""
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
-    from accelcal_cli.studies.navigation import Navigation
-    from accelcal_cli.studies.navigation_tables import beside, summary
-    from accelcal_cli.studies.voyages import load_waters
+    from accelcal_cli.navigation.study import Navigation, load_waters
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.views.navigation import beside, summary
 
     waters, entries, further = load_waters(name, {})
     number = further["seed"] if seed is None else seed
@@ -237,15 +235,15 @@ def _write(study: Navigation, records: Sequence[Record], output: str | None, plo
     if output is None and plot is None:
         return
     from accelcal_cli.output.files import whole_file
-    from accelcal_cli.output.plain import write_csv
-    from accelcal_cli.studies.navigation_tables import curves
+    from accelcal_cli.output.machine import write_csv
+    from accelcal_cli.views.navigation import curves
 
     found = curves(study, records)
     if output is not None:
         with whole_file(output) as file:
             write_csv(found, file)
     if plot is not None:
-        from accelcal_cli.output.voyage import plot_voyage
-        from accelcal_cli.studies.voyage_chart import chart_of
+        from accelcal_cli.output.plot import plot_voyage
+        from accelcal_cli.views.navigation import chart_of
 
         plot_voyage(chart_of(study, records, found), plot)

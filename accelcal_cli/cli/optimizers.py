@@ -18,9 +18,9 @@ def command(
     quiet: options.Quiet = False,  # noqa: ARG001  # every command takes it; this one never says more than it lists
 ) -> None:
     """List the optimizers, their settings and their papers."""
-    from accelcal_cli.output import catalogue as show
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
-    from accelcal_cli.studies.catalogue import catalogue, settings
+    from accelcal_cli.output import console as show
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.views.optimizers import catalogue, settings
 
     options.check_format(format)
     table = settings(name) if name else catalogue()

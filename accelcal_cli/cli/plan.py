@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from accelcal_cli.cli import options, pipes
+from accelcal_cli.cli import options
+from accelcal_cli.cli import process as pipes
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.plan import Plan
     from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.planning.plan import Plan
 
 MOST_POSES = 200
 FROM_NOTHING, NEXT = 12, 6
@@ -66,7 +67,7 @@ def command(
     Prints them in words and as vectors, and the sigma to expect after each. Exit code 1 means that not even all
     these poses determine the parameters.
     """
-    from accelcal_cli.calibration.planner import FIXTURES
+    from accelcal_cli.planning.design import FIXTURES
 
     options.check_format(format)
     if fixture not in FIXTURES:
@@ -91,9 +92,9 @@ def command(
 
 def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
     """Return the calibration of the poses so far."""
-    from accelcal_cli.calibration.pipeline import calibrate
+    from accelcal_cli.calibration.calibrate import calibrate
     from accelcal_cli.config import is_result, load_result, load_settings
-    from accelcal_cli.sensor.readings import read_readings
+    from accelcal_cli.io.readings import read_readings
 
     options.check_input(data)
     stdin = io.BufferedReader(cast("Any", sys.stdin.buffer)) if data == "-" else None
@@ -126,8 +127,8 @@ def _plan(
 ) -> Plan:
     import numpy as np
 
-    from accelcal_cli.calibration.plan import plan
-    from accelcal_cli.sensor.units import STANDARD_GRAVITY
+    from accelcal_cli.planning.plan import plan
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
     taken = 0 if so_far is None else so_far.poses
     count = add or ((poses or FROM_NOTHING) - taken if poses or so_far is None else NEXT)
@@ -145,8 +146,8 @@ def _plan(
 
 
 def _show(found: Plan, format: str) -> None:
-    from accelcal_cli.calibration.plan import parameter_table, pose_table, record
-    from accelcal_cli.output.plain import json_text, write_csv
+    from accelcal_cli.output.machine import json_text, write_csv
+    from accelcal_cli.planning.plan import parameter_table, pose_table, record
 
     if format == "json":
         sys.stdout.write(json_text(record(found)))

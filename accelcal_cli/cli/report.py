@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from accelcal_cli.cli import options, pipes
+from accelcal_cli.cli import options
+from accelcal_cli.cli import process as pipes
 from accelcal_cli.errors import UsageError
 
 SUFFIXES = (".html", ".htm")
@@ -30,7 +31,7 @@ def command(
     "undetermined"; the report is written all the same.
     """
     from accelcal_cli.output.files import check_target, is_stream, whole_file
-    from accelcal_cli.output.report import check_packages, page
+    from accelcal_cli.output.report.page import check_packages, page
 
     named = Path(output).suffix in SUFFIXES or Path(output).is_dir()
     if output != "-" and not named and not is_stream(output):

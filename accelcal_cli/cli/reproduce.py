@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options, running
+from accelcal_cli.cli import options
+from accelcal_cli.cli import options as running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.studies.experiment import Experiment
+    from accelcal_cli.studies.reproduce import Experiment
     from accelcal_cli.studies.study import Record
     from accelcal_cli.table import Table
 
@@ -66,7 +67,7 @@ def command(
 
 
 def _list(table: Table, format: str, stated: Sequence[object]) -> None:
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
 
     if any(value is not None for value in stated):
         raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
@@ -82,7 +83,7 @@ def _list(table: Table, format: str, stated: Sequence[object]) -> None:
 
 
 def _show(experiment: Experiment, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.plain import json_rows, json_text, write_csv
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.studies.reproduce import curves, tables
 
     shown = tables(experiment, records)
@@ -94,7 +95,7 @@ def _show(experiment: Experiment, records: Sequence[Record], format: str) -> Non
             sys.stdout.write("\n" if number else "")
             write_csv(table, sys.stdout)
     else:
-        from accelcal_cli.output.study import show_study
+        from accelcal_cli.output.console import show_study
 
         show_study(experiment.title, shown, curves(experiment, records, shown=True), experiment.note)
     sys.stdout.flush()

@@ -14,9 +14,9 @@ from accelcal_cli.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from accelcal_cli.arrays import Float
     from accelcal_cli.sensor.model import ErrorModel
     from accelcal_cli.sensor.simulation import Sensor, Simulated
-    from accelcal_cli.streams import Float
 
 MOST_SAMPLES = 100_000_000
 LARGEST_NOISE = 100.0
@@ -69,13 +69,12 @@ def command(
     """
     from accelcal_cli.config import dump, load_sensor
     from accelcal_cli.output.files import check_target, whole_file
-    from accelcal_cli.output.log import write_log
-    from accelcal_cli.registry import build
-    from accelcal_cli.sensor.motion import Handling, handled
+    from accelcal_cli.output.machine import write_log
+    from accelcal_cli.rng import Purpose, Streams
+    from accelcal_cli.schema import build
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import simulate, simulate_fleet
-    from accelcal_cli.sensor.units import STANDARD_GRAVITY
-    from accelcal_cli.streams import Purpose, Streams
+    from accelcal_cli.sensor.simulation import Handling, handled, simulate, simulate_fleet
 
     if noise is not None and not 0 <= noise <= LARGEST_NOISE:
         raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")

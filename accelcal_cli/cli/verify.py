@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options, pipes
+from accelcal_cli.cli import options
+from accelcal_cli.cli import process as pipes
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.calibration.verify import Verification
+    from accelcal_cli.verification.verify import Verification
 
 FAILED = 1
 
@@ -40,8 +41,8 @@ def command(
     of |f| - g against a tolerance. Exit code 1 means that the sensor has changed, that these readings cannot tell, or
     that --tolerance was missed.
     """
-    from accelcal_cli.calibration.verify import verify
-    from accelcal_cli.sensor.readings import read_readings
+    from accelcal_cli.io.readings import read_readings
+    from accelcal_cli.verification.verify import verify
 
     options.check_format(format)
     options.check_input(data)
@@ -73,15 +74,15 @@ def _check_gravity(g: float | None, old: Calibration, name: str) -> None:
 
 
 def _show(found: Verification, format: str) -> None:
-    from accelcal_cli.output.plain import json_text, write_csv
+    from accelcal_cli.output.machine import json_text, write_csv
 
     if format == "json":
         sys.stdout.write(json_text(found.record()))
     elif format == "csv":
-        from accelcal_cli.calibration.verify_tables import differences
+        from accelcal_cli.views.verification import differences
 
         write_csv(differences(found), sys.stdout)
     else:
-        from accelcal_cli.output.verification import show_verification
+        from accelcal_cli.output.console import show_verification
 
         show_verification(found)

@@ -1,4 +1,10 @@
-"""What a track is worth: errors, consistency and lock of every run, against the true position."""
+"""What a track is worth: errors, consistency and lock of every run, against the true position.
+
+The posterior Cramer-Rao bound of a scenario: what no filter's mean square error is below [tichavsky1998].
+
+The system is linear but for the map, and the noise is Gaussian; the recursion is then that of a Kalman filter whose
+measurement matrix is the slope of the map at the true position.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.navigation.filters import Track
-from accelcal_cli.navigation.scenario import Scenario
+from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.navigation.ins import metres_per_radian, process_noise
+from accelcal_cli.navigation.particle_filter import Track
+from accelcal_cli.navigation.scenario import Scenario, transitions
 from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR
-from accelcal_cli.streams import Bool, Float
 
 SETTLED = 3.0
 """Hour of the voyage from which errors count [depf2015] section 4."""
@@ -85,3 +92,28 @@ def _nees(error: Float, covariance: Float) -> Float:
     value: Float = ((c * north - 2.0 * b * east) * north + a * east**2) / (a * c - b * b)
     mean: Float = value.mean(axis=1)
     return mean
+
+
+def bound(scenario: Scenario) -> Float:
+    """Return the least variances of the position error north and east at every epoch, m^2, shape (K, 2).
+
+    A measurement that is missing, or taken where the map has no value, tells nothing.
+    """
+    route = scenario.route
+    latitude = np.atleast_2d(route.latitude)[0]
+    longitude = np.atleast_2d(route.longitude)[0]
+    north, east = scenario.gravity_map.slope(latitude, longitude)
+    slope = np.stack([north, east], axis=-1) / np.stack(metres_per_radian(latitude), axis=-1)
+    slope[np.isnan(slope).any(axis=1) | np.isnan(scenario.measured[0])] = 0.0
+    F = transitions(route, scenario.turns, (0, scenario.epochs), scenario.period, scenario.grade).reshape(
+        -1, 12, 12
+    )
+    Q = np.diag(process_noise(scenario.grade, scenario.period))
+    P = np.diag(scenario.prior())
+    out = np.empty((scenario.epochs, 2))
+    for k, h in enumerate(-slope):
+        gain = P[:, :2] @ h
+        P = P - np.outer(gain, gain) / (h @ gain[:2] + scenario.noise**2)
+        out[k] = P[0, 0], P[1, 1]
+        P = F[k] @ P @ F[k].T + Q
+    return out

@@ -12,11 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.navigation.earth import EARTH_RATE, metres_per_radian
-from accelcal_cli.navigation.error_model import STATES, Grade, Motion, dynamics, specific_force, turned
-from accelcal_cli.registry import check, setting
-from accelcal_cli.streams import Float, Streams
+from accelcal_cli.navigation.ins import (
+    EARTH_RATE,
+    STATES,
+    Grade,
+    Motion,
+    dynamics,
+    metres_per_radian,
+    specific_force,
+    turned,
+)
+from accelcal_cli.rng import Streams
+from accelcal_cli.schema import check, setting
 
 SECONDS_PER_HOUR = 3600.0
 CHUNK = 600

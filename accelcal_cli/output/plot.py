@@ -1,18 +1,32 @@
-"""Convergence as a picture: one panel a function, one line an optimizer, in PNG or SVG."""
+"""Convergence as a picture: one panel a function, one line an optimizer, in PNG or SVG.
+
+Pictures in files: one style, and the same data give the same file.
+
+A raw log as a picture: the three axes, and the intervals that were taken for static poses.
+
+Pictures of a navigation study: the tracks over the map, and RMSE against time on either axis and in position.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accelcal_cli.output.figure import line_style, picture
-from accelcal_cli.streams import Float
+from accelcal_cli.arrays import Float
+from accelcal_cli.detection.detect import Detection
+from accelcal_cli.output.files import whole_file
+from accelcal_cli.table import Table
+from accelcal_cli.views.navigation import BOUND, INS, Chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 ACROSS = 3
 """Panels side by side at most."""
@@ -79,3 +93,165 @@ def _panel(
     axes.ticklabel_format(axis="x", style="plain")
     axes.locator_params(axis="x", integer=True)
     axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
+
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which the colour-blind tell apart; a second round is dashed, a third dotted."""
+
+DASHES = ("-", "--", ":")
+DOTS_PER_INCH = 150
+
+
+@contextmanager
+def picture(path: str, width: float, height: float) -> Iterator[Figure]:
+    """Give a figure of a size in inches to draw on, and write it, whole or not at all.
+
+    Args:
+        path: ends in .png or .svg.
+        width, height: inches.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context({"svg.hashsalt": "accelcal", "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        yield figure
+        svg = Path(path).suffix == ".svg"
+        metadata: dict[str, Any] = {"Date": None} if svg else {}
+        with whole_file(path, binary=True) as file:
+            figure.savefig(file, format="svg" if svg else "png", dpi=DOTS_PER_INCH, metadata=metadata)
+
+
+def line_style(number: int) -> dict[str, Any]:
+    """Return how matplotlib draws line `number`, from 0: a colour of its own, then a dash of its own."""
+    dashes = DASHES[number // len(COLOURS) % len(DASHES)]
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes, "linewidth": 1.6}
+
+
+SHADE = "#F0E442"
+MOST_NUMBERS = 110
+"""An interval carries its number when it is at least as wide as this many side by side."""
+
+
+def plot_log(found: Detection, path: str) -> None:
+    """Write the picture, whole or not at all; the same log gives the same file.
+
+    Args:
+        found: a detection with its envelope.
+        path: ends in .png or .svg.
+    """
+    with picture(path, 12.0, 4.8) as figure:
+        axes = figure.subplots()
+        edges = _spans(found)
+        _log(axes, found)
+        _shade(axes, edges)
+        axes.set_title(
+            f"{Path(found.source).name}: {len(edges)} static poses, multiplier {found.multiplier:g}",
+            fontsize=11,
+            pad=14,
+        )
+        axes.set_xlabel("row" if found.intervals.time is None else "time")
+        axes.set_ylabel("output, sensor units")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+
+
+def _spans(found: Detection) -> Float:
+    """Return first and last abscissa of each interval, shape (I, 2)."""
+    poses = found.intervals
+    return np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
+
+
+def _shade(axes: Axes, edges: Float) -> None:
+    """Mark the intervals, and number those that have room for it."""
+    for k, (start, end) in enumerate(edges):
+        label = "" if k else "static pose"
+        axes.axvspan(start, end, color=SHADE, alpha=0.45, linewidth=0, zorder=0, label=label)
+        if (end - start) * MOST_NUMBERS > edges[-1, 1] - edges[0, 0]:
+            place = ((start + end) / 2, 1.0)
+            at = ("data", "axes fraction")
+            axes.annotate(str(k + 1), place, xycoords=at, ha="center", va="bottom", fontsize=6)
+
+
+def _log(axes: Axes, found: Detection) -> None:
+    """Draw each axis as the band between its least and greatest value in each bin."""
+    if found.envelope is None:
+        return
+    at, low, high = found.envelope.bins()
+    for k, axis in enumerate("xyz"):
+        name = found.columns[k]
+        label = axis if name.isdigit() else name
+        axes.fill_between(
+            at, low[:, k], high[:, k], step="post", color=COLOURS[k], alpha=0.9, linewidth=0.6, label=label
+        )
+    axes.margins(x=0.01)
+
+
+HOUR = 3600.0
+PANELS = (
+    ("rmse_latitude_m", "latitude"),
+    ("rmse_longitude_m", "longitude"),
+    ("rmse_position_m", "position"),
+)
+LEGEND = 125
+"""Characters across the picture."""
+
+LIMITS: dict[object, dict[str, Any]] = {
+    INS: {"color": "0.35", "lw": 1.2, "ls": ":"},
+    BOUND: {"color": "black", "lw": 1.0, "ls": "--"},
+}
+
+
+def plot_voyage(chart: Chart, path: str) -> None:
+    """Write the picture, whole or not at all: run 0's tracks, and the RMSE of all runs as [depf2015] figures 2 to 4.
+
+    Args:
+        chart: what it shows.
+        path: ends in .png or .svg.
+    """
+    with picture(path, 11.0, 8.5) as figure:
+        panels = figure.subplots(2, 2).ravel()
+        _draw_map(panels[0], chart)
+        _draw_errors(panels[1:], chart.curves)
+        handles, names = panels[0].get_legend_handles_labels()
+        columns = max(1, min(len(names), LEGEND // (max(map(len, names)) + 6)))
+        figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False)
+
+
+def _draw_map(axes: Any, chart: Chart) -> None:
+    """Draw the anomaly, the true and the indicated track, and where each filter puts run 0."""
+    picture = axes.imshow(
+        chart.anomaly,
+        origin="lower",
+        extent=chart.edges,
+        cmap="Greys",
+        alpha=0.6,
+        aspect="auto",
+        interpolation="bilinear",
+    )
+    axes.figure.colorbar(picture, ax=axes, label="gravity anomaly, mGal", shrink=0.8)
+    axes.plot(*chart.truth, color="black", lw=6.0, alpha=0.25, label="true")  # a band below the lines
+    axes.plot(*chart.indicated, label=INS, **LIMITS[INS])
+    for cell, (label, track) in enumerate(chart.tracks.items()):
+        axes.plot(*track, label=label, **line_style(cell))
+    for name, values in zip("xy", chart.truth, strict=True):
+        getattr(axes, f"set_{name}lim")(values.min() - 0.12, values.max() + 0.12)
+    axes.set(title="Run 0 over the map", xlabel="longitude, deg", ylabel="latitude, deg")
+
+
+def _draw_errors(panels: Any, curves: Table) -> None:
+    """Draw RMSE against time of every cell, with the bound and the INS alone."""
+    lines: dict[tuple[object, ...], list[Mapping[str, Any]]] = {}
+    for row in curves.records():
+        lines.setdefault((row["filter"], row["mode"], row["accelerometer_ug"]), []).append(row)
+    for axes, (key, name) in zip(panels, PANELS, strict=True):
+        for cell, ((kind, _, _), rows) in enumerate(lines.items()):
+            points = [(row["seconds"] / HOUR, row[key]) for row in rows if row[key] is not None]
+            if points:
+                axes.plot(*zip(*points, strict=True), **LIMITS.get(kind, line_style(cell)))
+            if kind == BOUND:
+                axes.annotate("bound", points[-1], fontsize=8, ha="right", va="top")
+        axes.set(title=f"RMSE of {name}", xlabel="hour of the voyage", ylabel="m", yscale="log")
+        axes.grid(True, color="0.9", linewidth=0.6)

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
+from accelcal_cli.arrays import Float
 from accelcal_cli.errors import UsageError, did_you_mean
-from accelcal_cli.streams import Float
 
 AXES = "xyz"
 
@@ -150,3 +150,8 @@ def describe(direction: Float) -> str:
         return f"corner between {name[0]}, {name[1]} and {name[2]} up"
     turn = math.degrees(math.atan2(size[2], size[1]))
     return f"{name[0]} up, tilted {tilt:.0f} degrees towards {name[1]} turned {turn:.0f} degrees to {name[2]}"
+
+
+def fixture_directions() -> Float:
+    """Return what can be held against a cube and its edges and corners: 26 directions, shape (26, 3)."""
+    return np.concatenate([faces(), edges(), corners()])

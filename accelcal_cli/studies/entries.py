@@ -10,8 +10,8 @@ from typing import Any
 
 from accelcal_cli.config import load_mapping, shipped_parameters
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.optimizers.base import OPTIMIZERS
-from accelcal_cli.registry import build
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.schema import build
 from accelcal_cli.studies.study import Entry
 
 ALL = "all"

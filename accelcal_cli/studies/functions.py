@@ -2,19 +2,189 @@
 
 All have the minimum 0 at a known point. The optimum may be moved off the centre of the box and the coordinates
 rotated about it: an optimizer that only finds the centre, or only moves along the axes, is exposed.
+
+The formulas of the test functions of z, shape (..., D); each returns costs of shape (...).
+
+Test functions that are sums of squares: their residuals and Jacobians, for least-squares methods.
+
+z has the shape (..., D), residuals (..., M), Jacobians (..., M, D).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.problem import Problem
-from accelcal_cli.streams import Float, Purpose, Streams
-from accelcal_cli.studies import formulas, squares
+from accelcal_cli.optimization.problem import Problem
+from accelcal_cli.rng import Purpose, Streams
+
+SCHWEFEL_POINT = 420.968746359982
+SCHWEFEL_LEVEL = SCHWEFEL_POINT * math.sin(math.sqrt(SCHWEFEL_POINT))
+STYBLINSKI_POINT = -2.903534027771177
+STYBLINSKI_LEVEL = STYBLINSKI_POINT**4 - 16.0 * STYBLINSKI_POINT**2 + 5.0 * STYBLINSKI_POINT
+
+
+def sphere(z: Float) -> Float:
+    """Return sum z_i^2. [dpso2014] section 3.1."""
+    total: Float = np.add.reduce(z * z, axis=-1)
+    return total
+
+
+def rosenbrock(z: Float) -> Float:
+    """Return sum 100 (z_{i+1} - z_i^2)^2 + (z_i - 1)^2. [dpso2014] section 3.1."""
+    first = z[..., :-1]
+    valley = first * first
+    np.subtract(z[..., 1:], valley, out=valley)
+    valley *= valley
+    valley *= 100.0
+    slope = first - 1.0
+    slope *= slope
+    valley += slope
+    total: Float = np.add.reduce(valley, axis=-1)
+    return total
+
+
+def modified_rosenbrock(z: Float) -> Float:
+    """Return sum 100 (z_{i+1} + z_i^2)^2 + (z_i + 1)^2, minimum at -1. [ifoa2021] section 3.1, reconstructed."""
+    return rosenbrock(-z)
+
+
+def rastrigin(z: Float) -> Float:
+    """Return sum z_i^2 - 10 cos(2 pi z_i) + 10. [dpso2014] section 3.1."""
+    waves = np.cos(2.0 * math.pi * z)
+    waves *= -10.0
+    waves += z * z
+    waves += 10.0
+    total: Float = np.add.reduce(waves, axis=-1)
+    return total
+
+
+def griewank(z: Float) -> Float:
+    """Return sum z_i^2 / 4000 - prod cos(z_i / sqrt(i)) + 1. [dpso2014] section 3.1."""
+    roots = np.sqrt(np.arange(1.0, z.shape[-1] + 1.0))
+    waves = np.multiply.reduce(np.cos(z / roots), axis=-1)
+    total: Float = np.add.reduce(z * z, axis=-1) / 4000.0 - waves + 1.0
+    return total
+
+
+def ackley(z: Float) -> Float:
+    """Return Ackley's function: 20 + e - 20 exp(-0.2 rms(z)) - exp(mean cos(2 pi z)). [jamil2013] 1."""
+    rms = np.sqrt(np.mean(z * z, axis=-1))
+    total = 20.0 + math.e - 20.0 * np.exp(-0.2 * rms) - np.exp(np.mean(np.cos(2 * math.pi * z), axis=-1))
+    least: Float = np.maximum(total, 0.0)  # rounding would leave -4e-16
+    return least
+
+
+def schwefel(z: Float) -> Float:
+    """Return 418.98 D - sum z_i sin(sqrt |z_i|), continued quadratically beyond 500. [jamil2013] 2.26."""
+    inside = np.clip(z, -500.0, 500.0)
+    waves = inside * np.sin(np.sqrt(np.abs(inside)))
+    beyond = z - inside
+    total: Float = np.add.reduce(SCHWEFEL_LEVEL - waves + beyond * beyond, axis=-1)
+    return total
+
+
+def levy(z: Float) -> Float:
+    """Return Levy's function with w = 1 + (z - 1) / 4. [laguna2005]."""
+    w = 1.0 + (z - 1.0) / 4.0
+    head = np.sin(math.pi * w[..., 0]) ** 2
+    body = (w[..., :-1] - 1.0) ** 2 * (1.0 + 10.0 * np.sin(math.pi * w[..., :-1] + 1.0) ** 2)
+    tail = (w[..., -1] - 1.0) ** 2 * (1.0 + np.sin(2.0 * math.pi * w[..., -1]) ** 2)
+    total: Float = head + np.add.reduce(body, axis=-1) + tail
+    return total
+
+
+def zakharov(z: Float) -> Float:
+    """Return s + t^2 + t^4 with s = sum z_i^2, t = sum i z_i / 2. [jamil2013] 173."""
+    t = z @ (0.5 * np.arange(1.0, z.shape[-1] + 1.0))
+    total: Float = np.add.reduce(z * z, axis=-1) + t**2 + t**4
+    return total
+
+
+def elliptic(z: Float) -> Float:
+    """Return sum 10^(6 (i - 1) / (D - 1)) z_i^2: a bowl a thousand times as long as wide. [hansen2016]."""
+    total: Float = np.add.reduce(elliptic_weights(z.shape[-1]) * (z * z), axis=-1)
+    return total
+
+
+def elliptic_weights(dimensions: int) -> Float:
+    """Return the D coefficients of `elliptic`."""
+    return np.logspace(0.0, 6.0, dimensions)
+
+
+def styblinski_tang(z: Float) -> Float:
+    """Return sum (z_i^4 - 16 z_i^2 + 5 z_i) / 2 above its least value, -39.166 D. [jamil2013] 144."""
+    square = z * z
+    total = np.add.reduce(square * square - 16.0 * square + 5.0 * z - STYBLINSKI_LEVEL, axis=-1)
+    least: Float = np.maximum(0.5 * total, 0.0)  # rounding would leave -1e-14
+    return least
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Residuals r(z), whose squares sum to the function, and their Jacobian dr/dz."""
+
+    residuals: Callable[[Float], Float]
+    jacobian: Callable[[Float], Float]
+
+
+def _diagonal(z: Float, weights: Float) -> Float:
+    """Return a constant diagonal Jacobian for every point."""
+    return np.broadcast_to(np.diag(weights), (*z.shape, z.shape[-1])).copy()
+
+
+def _elliptic(z: Float) -> Float:
+    root: Float = np.sqrt(elliptic_weights(z.shape[-1]))
+    return root
+
+
+def _valley(z: Float) -> Float:
+    """Rosenbrock: r = 10 (z_{i+1} - z_i^2), then z_i - 1."""
+    first = z[..., :-1]
+    return np.concatenate([10.0 * (z[..., 1:] - first * first), first - 1.0], axis=-1)
+
+
+def _valley_jacobian(z: Float) -> Float:
+    D = z.shape[-1]
+    rows = np.arange(D - 1)
+    J = np.zeros((*z.shape[:-1], 2 * (D - 1), D))
+    J[..., rows, rows] = -20.0 * z[..., :-1]
+    J[..., rows, rows + 1] = 10.0
+    J[..., D - 1 + rows, rows] = 1.0
+    return J
+
+
+def _zakharov(z: Float) -> Float:
+    """Zakharov: r = z_i, then t and t^2 with t = sum i z_i / 2."""
+    t = z @ _ramp(z)
+    return np.concatenate([z, t[..., None], (t * t)[..., None]], axis=-1)
+
+
+def _zakharov_jacobian(z: Float) -> Float:
+    slope = _ramp(z)
+    t = z @ slope
+    last = np.broadcast_to(slope, z.shape)
+    return np.concatenate(
+        [_diagonal(z, np.ones(z.shape[-1])), last[..., None, :], (2.0 * t[..., None] * last)[..., None, :]],
+        axis=-2,
+    )
+
+
+def _ramp(z: Float) -> Float:
+    return 0.5 * np.arange(1.0, z.shape[-1] + 1.0)
+
+
+SPHERE = Squares(lambda z: z, lambda z: _diagonal(z, np.ones(z.shape[-1])))
+ELLIPTIC = Squares(lambda z: z * _elliptic(z), lambda z: _diagonal(z, _elliptic(z)))
+ROSENBROCK = Squares(_valley, _valley_jacobian)
+MODIFIED_ROSENBROCK = Squares(lambda z: _valley(-z), lambda z: -_valley_jacobian(-z))
+ZAKHAROV = Squares(_zakharov, _zakharov_jacobian)
+
 
 MARGIN = 0.1
 """A moved optimum keeps this part of the half box from the walls."""
@@ -29,23 +199,21 @@ class Definition:
     high: float
     optimum: float = 0.0
     start: tuple[float, float] | None = None
-    squares: squares.Squares | None = None
+    squares: Squares | None = None
 
 
 FUNCTIONS = {
-    "sphere": Definition(formulas.sphere, -100, 100, squares=squares.SPHERE),
-    "rosenbrock": Definition(formulas.rosenbrock, -30, 30, 1.0, squares=squares.ROSENBROCK),
-    "rastrigin": Definition(formulas.rastrigin, -5.12, 5.12),
-    "griewank": Definition(formulas.griewank, -600, 600),
-    "modified-rosenbrock": Definition(
-        formulas.modified_rosenbrock, -30, 30, -1.0, (-1.0, 1.0), squares.MODIFIED_ROSENBROCK
-    ),
-    "ackley": Definition(formulas.ackley, -32.768, 32.768),
-    "schwefel": Definition(formulas.schwefel, -500, 500, formulas.SCHWEFEL_POINT),
-    "levy": Definition(formulas.levy, -10, 10, 1.0),
-    "zakharov": Definition(formulas.zakharov, -5, 10, squares=squares.ZAKHAROV),
-    "elliptic": Definition(formulas.elliptic, -100, 100, squares=squares.ELLIPTIC),
-    "styblinski-tang": Definition(formulas.styblinski_tang, -5, 5, formulas.STYBLINSKI_POINT),
+    "sphere": Definition(sphere, -100, 100, squares=SPHERE),
+    "rosenbrock": Definition(rosenbrock, -30, 30, 1.0, squares=ROSENBROCK),
+    "rastrigin": Definition(rastrigin, -5.12, 5.12),
+    "griewank": Definition(griewank, -600, 600),
+    "modified-rosenbrock": Definition(modified_rosenbrock, -30, 30, -1.0, (-1.0, 1.0), MODIFIED_ROSENBROCK),
+    "ackley": Definition(ackley, -32.768, 32.768),
+    "schwefel": Definition(schwefel, -500, 500, SCHWEFEL_POINT),
+    "levy": Definition(levy, -10, 10, 1.0),
+    "zakharov": Definition(zakharov, -5, 10, squares=ZAKHAROV),
+    "elliptic": Definition(elliptic, -100, 100, squares=ELLIPTIC),
+    "styblinski-tang": Definition(styblinski_tang, -5, 5, STYBLINSKI_POINT),
 }
 """By name: boxes of the first four from [dpso2014] section 3.1, of the others as usual in the literature."""
 
@@ -122,7 +290,7 @@ class TestFunction(Problem):
         inner = self._squares().jacobian(self._inner(x))
         return inner if self._turn is None else inner @ self._turn
 
-    def _squares(self) -> squares.Squares:
+    def _squares(self) -> Squares:
         if self.definition.squares is None:
             raise NotImplementedError(f"{self.name} is no sum of squares")
         return self.definition.squares

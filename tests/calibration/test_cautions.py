@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from simulated import DPSO, noise, readings
 
-from accelcal_cli.calibration import cautions
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.quality import design
+from accelcal_cli.calibration import assess as cautions
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.observability import design
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.readings import Readings
 
 G = 9.8
 FAST = Settings(optimizer="levenberg-marquardt", g=G)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from accelcal_cli.calibration.chances import Noise, Pair, combined, holm
-from accelcal_cli.calibration.quality import design
+from accelcal_cli.calibration.distributions import Noise, Pair, combined, holm
+from accelcal_cli.calibration.observability import design
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
-from accelcal_cli.streams import Streams
 
 SETS = {
     "12": poses.faces_edges(),

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, MEMS, noise, rotation
 
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.ellipsoid import fit_ellipsoid
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
 

@@ -13,15 +13,14 @@ import pytest
 import yaml
 from simulated import MEMS, readings
 
-from accelcal_cli.calibration.exporters.base import Target
-from accelcal_cli.calibration.exporters.formats import FORMATS, export
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import UsageError
+from accelcal_cli.exporters.base import Target
+from accelcal_cli.exporters.formats import FORMATS, export
+from accelcal_cli.io.readings import read_readings
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.readings import read_readings
-from accelcal_cli.sensor.units import STANDARD_GRAVITY
+from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
 G = 9.8
 COUNTS = ErrorModel(415.0 * MEMS.K, 415.0 * MEMS.D + 120.0)

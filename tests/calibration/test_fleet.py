@@ -10,20 +10,18 @@ import numpy as np
 import pytest
 from simulated import MEMS, noise
 
-from accelcal_cli.calibration.chances import chi_square_chance, student_chance
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.ellipsoid import fit_ellipsoid, least_squares
-from accelcal_cli.calibration.fleet import FAILED, calibrate_fleet
-from accelcal_cli.calibration.fleet_tables import counts, sensors, summary
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
+from accelcal_cli.calibration.fleet import FAILED, calibrate_fleet, standouts
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid, least_squares
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
-from accelcal_cli.calibration.standouts import standouts
 from accelcal_cli.errors import AccelcalError, ConfigError, DataError
+from accelcal_cli.io.fleet import read_fleet
+from accelcal_cli.io.readings import read_readings
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.fleet_files import read_fleet
-from accelcal_cli.sensor.readings import read_readings
 from accelcal_cli.sensor.simulation import Sensor, Spread, draw
-from accelcal_cli.streams import Streams
+from accelcal_cli.views.fleet import counts, sensors, summary
 
 G = 9.81
 LM = Settings(optimizer="levenberg-marquardt", g=G)
@@ -468,8 +466,8 @@ def test_what_a_fleet_cannot_do_is_refused(wrong):
 def test_slabs_and_batches_change_nothing(mixed, monkeypatch):
     path, _ = mixed
     whole = calibrate_fleet(read_fleet([path]), LM)
-    monkeypatch.setattr("accelcal_cli.sensor.fleet.SLAB", 30)
-    monkeypatch.setattr("accelcal_cli.sensor.fleet.BATCH", 40)
+    monkeypatch.setattr("accelcal_cli.io.fleet.SLAB", 30)
+    monkeypatch.setattr("accelcal_cli.io.fleet.BATCH", 40)
     parts = calibrate_fleet(read_fleet([path]), LM)
     np.testing.assert_array_equal(parts.number, whole.number)
     assert parts.verdict.tolist() == whole.verdict.tolist()

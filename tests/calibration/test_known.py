@@ -10,19 +10,19 @@ import pytest
 import scipy.stats
 from simulated import MEMS, noise, rotation
 
-from accelcal_cli.calibration.exporters.base import Target
-from accelcal_cli.calibration.exporters.formats import export
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.fit import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.tables import engineering
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.navigation.error_model import Grade
+from accelcal_cli.exporters.base import Target
+from accelcal_cli.exporters.formats import export
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.navigation.ins import Grade
+from accelcal_cli.navigation.study import grade_of
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge
-from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.studies.voyages import grade_of
+from accelcal_cli.views.calibration import engineering
 
 G, SIGMA = 9.8, 2e-3
 KNOWN = Settings(g=G, attitudes="known")

@@ -8,11 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, direct_cost, dpso_box, loetters, noise, rotation
 
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.lotters import Box, Loetters, pack, unpack
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack, unpack
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge
-from accelcal_cli.streams import Streams
 
 G = 9.8
 OUTPUT = DPSO.output(G * poses.turns() + noise(24, 0.02, 3))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from simulated import DPSO, dpso_box, loetters, readings
 
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
-from accelcal_cli.optimizers.base import OPTIMIZERS
-from accelcal_cli.optimizers.minimize import minimize
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge
 

@@ -9,20 +9,20 @@ import pytest
 from scipy.optimize import least_squares
 from simulated import DPSO, noise
 
-from accelcal_cli.calibration.exporters.base import Target
-from accelcal_cli.calibration.exporters.formats import export
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.fleet import check_settings
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.plan import plan, pose_table
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.tables import tables
-from accelcal_cli.calibration.verify import verify
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.optimizers.base import OPTIMIZERS
+from accelcal_cli.exporters.base import Target
+from accelcal_cli.exporters.formats import export
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.planning.plan import plan, pose_table
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.verification.verify import verify
+from accelcal_cli.views.calibration import tables
 
 G = 9.8
 ALIGNED = ErrorModel(np.diag(np.diagonal(DPSO.K)), DPSO.D)

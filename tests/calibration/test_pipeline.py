@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from simulated import DPSO, MEMS, direct_cost, noise, readings, rotation
 
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.planner import fixture_directions
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
 from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import GAUGES
-from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Streams
+from accelcal_cli.sensor.poses import fixture_directions
 
 G = 9.8
 FAST = Settings(optimizer="levenberg-marquardt", g=G)

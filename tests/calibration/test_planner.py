@@ -11,24 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated import DPSO, rotation
 
-from accelcal_cli.calibration import quality
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.lotters import Box, Loetters, pack
-from accelcal_cli.calibration.plan import parameter_table, plan, pose_table, record
-from accelcal_cli.calibration.planner import (
-    FIXTURES,
-    PRIOR,
-    best_poses,
-    candidates,
-    distinct_poses,
-    fixture_directions,
-    next_poses,
-)
-from accelcal_cli.calibration.quality import PARAMETERS, Observability, design
-from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
-from accelcal_cli.optimizers.minimize import minimize
+from accelcal_cli.calibration import observability as quality
+from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, next_poses
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
+from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.planning.design import FIXTURES, PRIOR, best_poses, candidates, distinct_poses
+from accelcal_cli.planning.plan import parameter_table, plan, pose_table, record
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
-from accelcal_cli.streams import Streams
+from accelcal_cli.sensor.poses import fixture_directions
 
 
 def _information(u):

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, MEMS, dpso_box, loetters, rotation
 
-from accelcal_cli.calibration import quality
-from accelcal_cli.calibration.lotters import Box, pack
-from accelcal_cli.calibration.quality import PARAMETERS, Observability, design, in_words
-from accelcal_cli.calibration.sigma import firm, propagate
+from accelcal_cli.calibration import observability as quality
+from accelcal_cli.calibration.fit import firm, propagate
+from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, in_words
+from accelcal_cli.calibration.problem import Box, pack
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
@@ -246,11 +246,10 @@ def test_sigma_is_missing_where_the_covariance_is():
 
 def test_sigma_of_a_real_fit_is_what_repeated_noise_gives():
     """Propagated sigma against the spread of 400 fits with fresh noise, in every gauge."""
-    from accelcal_cli.calibration.compress import compress_each
-    from accelcal_cli.calibration.lotters import Loetters
-    from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
-    from accelcal_cli.optimizers.minimize import minimize
-    from accelcal_cli.streams import Streams
+    from accelcal_cli.calibration.problem import Loetters, compress_each
+    from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
+    from accelcal_cli.optimization.minimize import minimize
+    from accelcal_cli.rng import Streams
 
     runs, sigma, truth = 400, 1e-3, MEMS.in_gauge("lower")
     force = G * poses.icosahedron() @ rotation(4)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.sensor.readings import read_readings
+from accelcal_cli.io.readings import read_readings
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def test_the_data_sheet_of_the_xsens(shared_data):
 
 def test_a_pose_set_cut_to_a_few_is_not_called_good(shared_data):
     """The first eight poses of each recording are too few, and the verdict says so."""
-    from accelcal_cli.sensor.readings import Readings
+    from accelcal_cli.io.readings import Readings
 
     for expected in RECORDINGS.values():
         output = read_readings(shared_data / expected.file).output()

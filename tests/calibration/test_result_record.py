@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from simulated import MEMS, noise, readings
 
-from accelcal_cli.calibration.parts import Dop, PoseFit, Sigma
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.result import SCHEMA, Calibration
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.result import SCHEMA, Calibration, Dop, PoseFit, Sigma, Temperature
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.temperature import Temperature
 from accelcal_cli.config import dump, load_mapping
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.readings import Readings
 
 G = 9.8
 

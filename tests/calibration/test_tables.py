@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from simulated import DPSO, MEMS, noise, readings
 
-from accelcal_cli.calibration import tables
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Nominal, Settings
-from accelcal_cli.sensor import poses, units
-from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.sensor import model as units
+from accelcal_cli.sensor import poses
+from accelcal_cli.views import calibration as tables
 
 G = 9.8
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from simulated import MEMS, noise
 
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.temperature import _linearised
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.readings import Readings
 
 G, SIGMA = 9.8, 2e-3
 SETTINGS = Settings(optimizer="levenberg-marquardt", g=G)

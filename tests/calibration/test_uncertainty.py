@@ -9,17 +9,16 @@ import pytest
 from scipy.stats import chi2, t
 from simulated import DPSO, MEMS, noise
 
-from accelcal_cli.calibration import quality
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.lotters import Box, Loetters, pack
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration import observability as quality
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.fit import propagate
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.sigma import propagate
-from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
-from accelcal_cli.optimizers.minimize import Status, minimize
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
+from accelcal_cli.optimization.minimize import Status, minimize
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.readings import Readings
-from accelcal_cli.streams import Streams
 
 G, RUNS, SIGMA = 9.8, 2000, 1e-3
 TRUTH = DPSO.in_gauge("lower")

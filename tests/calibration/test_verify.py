@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from simulated import MEMS, noise, readings, rotation
 
-from accelcal_cli.calibration.pipeline import calibrate
-from accelcal_cli.calibration.quality import PARAMETERS, design
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.observability import PARAMETERS, design
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.verify import verify
-from accelcal_cli.calibration.verify_tables import differences, evidence
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.readings import Readings
+from accelcal_cli.verification.verify import verify
+from accelcal_cli.views.verification import differences, evidence
 
 G, SIGMA = 9.8, 2e-3
 FAST = Settings(optimizer="levenberg-marquardt", g=G)
@@ -295,8 +295,8 @@ def test_an_axis_that_died_is_a_matter_of_the_sensor():
 
 
 def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
-    monkeypatch.setattr("accelcal_cli.calibration.verify.check_unit", lambda *_: None)
-    monkeypatch.setattr("accelcal_cli.calibration.doubts.doubts", lambda *_: ())
+    monkeypatch.setattr("accelcal_cli.verification.verify.check_unit", lambda *_: None)
+    monkeypatch.setattr("accelcal_cli.verification.verify.doubts", lambda *_: ())
     plain = ErrorModel(1670.0 * np.eye(3), np.zeros(3))
     old = calibrate(readings(TURNS, model=plain, sigma=SIGMA, seed=1), FAST)
     found = verify(old, Readings.from_array(new(poses.faces()[:2], model=plain).output() / 1e4))

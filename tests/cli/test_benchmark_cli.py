@@ -12,7 +12,7 @@ import sys
 
 import pytest
 
-from accelcal_cli.optimizers.base import OPTIMIZERS
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
 
 QUICK = ("benchmark", "--dim", "3", "--runs", "4", "--population", "10", "--iterations", "15", "--quiet")
 PAIR = ("--func", "sphere,rastrigin", "--optimizer", "pso", "--optimizer", "de")

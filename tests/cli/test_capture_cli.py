@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from accelcal_cli.calibration.planner import candidates, distinct_poses
 from accelcal_cli.errors import OutputError
-from accelcal_cli.output import capture
-from accelcal_cli.streams import Streams
+from accelcal_cli.output import live as capture
+from accelcal_cli.planning.design import candidates, distinct_poses
+from accelcal_cli.rng import Streams
 
 FAST = ("--port", "-", "--rate", "20", "--window", "1", "--hold", "2")
 

@@ -302,7 +302,7 @@ def test_an_unknown_command_or_option_is_refused(run, arguments, part):
 def test_a_folder_without_permission_is_refused_before_the_work(run, good, monkeypatch):
     monkeypatch.setattr("accelcal_cli.output.files.os.access", lambda *_: False)  # root may write anywhere
     monkeypatch.setattr(
-        "accelcal_cli.calibration.pipeline.calibrate", lambda *_: pytest.fail("worked in vain")
+        "accelcal_cli.calibration.calibrate.calibrate", lambda *_: pytest.fail("worked in vain")
     )
     refused(run("calibrate", good, *RESULT), ["result.yaml", "permission denied"])
 

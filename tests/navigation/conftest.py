@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.field import PRESETS, generate
+from accelcal_cli.navigation.gravity_map import PRESETS, generate
+from accelcal_cli.navigation.ins import Grade
 from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.voyage import Plan
 

@@ -7,18 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from accelcal_cli.navigation.bound import bound
-from accelcal_cli.navigation.differential import metropolis
-from accelcal_cli.navigation.earth import metres_per_radian
-from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.field import PRESETS, generate
-from accelcal_cli.navigation.filters import FILTERS, Track
-from accelcal_cli.navigation.marginal import Gaussian, Marginal
-from accelcal_cli.navigation.particle import Cloud
-from accelcal_cli.navigation.reference import Bank, Reference, _widened
+from accelcal_cli.navigation.filters.de_pf import Gaussian, Marginal, metropolis
+from accelcal_cli.navigation.filters.reference import Bank, Reference, _widened
+from accelcal_cli.navigation.gravity_map import PRESETS, generate
+from accelcal_cli.navigation.ins import Grade, metres_per_radian
+from accelcal_cli.navigation.particle_filter import FILTERS, Cloud, Track
 from accelcal_cli.navigation.scenario import simulate, transitions
+from accelcal_cli.navigation.scores import bound
 from accelcal_cli.navigation.voyage import Plan
-from accelcal_cli.streams import Purpose, Streams
+from accelcal_cli.rng import Purpose, Streams
 
 WINDOW = 5
 

@@ -10,19 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.navigation.apo_pf import forces, masses
-from accelcal_cli.navigation.bound import bound
-from accelcal_cli.navigation.de_pf import IDLE
-from accelcal_cli.navigation.differential import Operators, evolve, metropolis
-from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.field import PRESETS, generate
-from accelcal_cli.navigation.filters import FILTERS
-from accelcal_cli.navigation.gravity_map import GravityMap
-from accelcal_cli.navigation.resampling import SCHEMES, effective_size, normalised
+from accelcal_cli.navigation.filters.apo_pf import forces, masses
+from accelcal_cli.navigation.filters.de_pf import IDLE, Operators, evolve, metropolis
+from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, generate
+from accelcal_cli.navigation.ins import Grade
+from accelcal_cli.navigation.particle_filter import FILTERS, SCHEMES, effective_size, normalised
 from accelcal_cli.navigation.scenario import simulate
-from accelcal_cli.navigation.scores import counted, score
+from accelcal_cli.navigation.scores import bound, counted, score
 from accelcal_cli.navigation.voyage import Plan
-from accelcal_cli.streams import Purpose, Streams
+from accelcal_cli.rng import Purpose, Streams
 
 NAMES = ["apo-pf", "de-pf", "pf", "pso-pf", "reference"]
 

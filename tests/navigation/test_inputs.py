@@ -15,15 +15,14 @@ import pytest
 
 import accelcal_cli
 from accelcal_cli.errors import AccelcalError, DataError
-from accelcal_cli.navigation.error_model import Grade
-from accelcal_cli.navigation.field import PRESETS, Field, generate
-from accelcal_cli.navigation.filters import FILTERS
-from accelcal_cli.navigation.map_files import load_map
+from accelcal_cli.navigation.gravity_map import PRESETS, Field, generate, load_map
+from accelcal_cli.navigation.ins import Grade
+from accelcal_cli.navigation.particle_filter import FILTERS
+from accelcal_cli.navigation.scenario import read_voyage, recorded
+from accelcal_cli.navigation.study import Waters, load_waters
 from accelcal_cli.navigation.voyage import Plan
-from accelcal_cli.navigation.voyage_file import read_voyage, recorded
-from accelcal_cli.studies.navigation_tables import COLUMNS, beside
-from accelcal_cli.studies.voyages import Waters, load_waters
 from accelcal_cli.table import Table
+from accelcal_cli.views.navigation import COLUMNS, beside
 
 ROOT = Path(accelcal_cli.__file__).parents[1]
 SMALL = Field(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0)

@@ -8,13 +8,11 @@ import pytest
 import scipy.linalg
 
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.navigation import earth
-from accelcal_cli.navigation.bound import bound
-from accelcal_cli.navigation.error_model import Grade, Motion, discretise, dynamics, metric
-from accelcal_cli.navigation.field import PRESETS, generate
-from accelcal_cli.navigation.gravity_map import GravityMap
+from accelcal_cli.navigation import ins as earth
+from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, generate
+from accelcal_cli.navigation.ins import Grade, Motion, discretise, dynamics, metric
 from accelcal_cli.navigation.scenario import simulate
-from accelcal_cli.navigation.scores import counted
+from accelcal_cli.navigation.scores import bound, counted
 from accelcal_cli.navigation.voyage import Plan, planned
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from known_problems import CASES, Holed, watched
 
-from accelcal_cli.optimizers.minimize import Status, Stopping, minimize
+from accelcal_cli.optimization.minimize import Status, Stopping, minimize
 
 RUNS = 3
 

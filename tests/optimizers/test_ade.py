@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from known_problems import ShiftedSphere
 
-from accelcal_cli.optimizers.ade import AdaptiveEvolution
-from accelcal_cli.streams import Streams
+from accelcal_cli.optimization.algorithms.ade import AdaptiveEvolution
+from accelcal_cli.rng import Streams
 
 P, D = 20, 4
 

@@ -8,8 +8,8 @@ import contract
 import pytest
 
 from accelcal_cli.config import load_mapping, shipped
-from accelcal_cli.optimizers.base import OPTIMIZERS, State
-from accelcal_cli.optimizers.minimize import minimize
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, State
 
 NAMES = OPTIMIZERS.names()
 PAIRS = [(name, case) for name in NAMES for case in contract.cases(OPTIMIZERS.get(name))]

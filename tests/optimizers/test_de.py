@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimizers.base import gather, integers, partners
-from accelcal_cli.optimizers.de import DifferentialEvolution, mutates
-from accelcal_cli.streams import Streams
+from accelcal_cli.optimization.algorithms.de import DifferentialEvolution, mutates
+from accelcal_cli.optimization.operators import gather, integers, partners
+from accelcal_cli.rng import Streams
 
 
 def _pairs(seed, runs, population):

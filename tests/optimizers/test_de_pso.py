@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimizers.de_pso import HybridSwarm
-from accelcal_cli.streams import Streams
+from accelcal_cli.optimization.algorithms.de_pso import HybridSwarm
+from accelcal_cli.rng import Streams
 
 
 class Flat(ShiftedSphere):

@@ -8,10 +8,9 @@ from known_problems import Decay, Watched
 from scipy.optimize import least_squares
 from simulated import DPSO, MEMS, dpso_box, loetters, noise
 
-from accelcal_cli.calibration.compress import compress_each
-from accelcal_cli.calibration.lotters import Box, Loetters, pack
-from accelcal_cli.optimizers.levenberg_marquardt import LevenbergMarquardt
-from accelcal_cli.optimizers.minimize import Status, minimize
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
+from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
+from accelcal_cli.optimization.minimize import Status, minimize
 from accelcal_cli.sensor import poses
 
 G = 9.8

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimizers.base import better_of
-from accelcal_cli.optimizers.minimize import minimize
-from accelcal_cli.optimizers.pso import ParticleSwarm, pairs, velocity
-from accelcal_cli.streams import Streams
+from accelcal_cli.optimization.algorithms.pso import ParticleSwarm, pairs, velocity
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.operators import better_of
+from accelcal_cli.rng import Streams
 
 
 @given(st.integers(0, 10**6), st.floats(0, 2), st.floats(0, 4), st.floats(0, 4))

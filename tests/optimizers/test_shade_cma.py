@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimizers.shade_cma import ShadeCma
-from accelcal_cli.streams import Streams
+from accelcal_cli.optimization.algorithms.shade_cma import ShadeCma
+from accelcal_cli.rng import Streams
 
 SETTINGS = ShadeCma(population=20, evaluations=5000, memory=3)
 

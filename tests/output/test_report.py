@@ -13,13 +13,12 @@ import pytest
 from simulated import MEMS, noise, readings
 
 import accelcal_cli
-from accelcal_cli.calibration.pipeline import calibrate
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.output import pictures
-from accelcal_cli.output.report import page, typeset
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.output.report.page import page, pictures, typeset
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.readings import Readings
 
 G = 9.8
 VOID = ("meta", "link", "br")

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from simulated import MEMS
 
-from accelcal_cli.calibration.planner import candidates, distinct_poses
+from accelcal_cli.detection.capture import Capture, rough_sensor
 from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.io.readings import read_readings
+from accelcal_cli.io.serial import file_lines, numbers, pick, port_lines, readings
+from accelcal_cli.planning.design import candidates, distinct_poses
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.capture import Capture, numbers, pick, rough_sensor
-from accelcal_cli.sensor.lines import file_lines, port_lines, readings
-from accelcal_cli.sensor.readings import read_readings
-from accelcal_cli.streams import Streams
 
 ROOT = Path(__file__).parents[2]
 G = 9.8

@@ -7,7 +7,7 @@ import io
 import pytest
 
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor.readings import Readings, read_readings
+from accelcal_cli.io.readings import Readings, read_readings
 
 
 def read(header: str, columns: list[str] | None = None) -> Readings:

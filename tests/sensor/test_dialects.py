@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor.dialect import sniff
-from accelcal_cli.sensor.readings import read_readings
+from accelcal_cli.io.dialect import sniff
+from accelcal_cli.io.readings import read_readings
 
 NUMBERS = st.floats(-1e9, 1e9).map(lambda value: value + 0.0)
 ROWS = st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=2, max_size=12)

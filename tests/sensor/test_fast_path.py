@@ -9,10 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor.cells import CarefulParser, Selection
-from accelcal_cli.sensor.dialect import Dialect
-from accelcal_cli.sensor.fastcells import FastParser
-from accelcal_cli.sensor.source import ByteSource
+from accelcal_cli.io.dialect import Dialect
+from accelcal_cli.io.stream import ByteSource
+from accelcal_cli.io.text import CarefulParser, FastParser, Selection
 
 ODD_CELLS = [
     "", " ", "nan", "NaN", "inf", "-inf", "1e999", "1e101", "-1e100", "abc", "1_000", "0x10", "1.5.2", "+",

@@ -8,13 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raw_logs import in_blocks, opened, simulated, text
 
-from accelcal_cli.calibration.detection import DetectSettings, TooFewPosesError, detect
-from accelcal_cli.sensor.clock import Clock
-from accelcal_cli.sensor.gaps import Gaps, Limit
-from accelcal_cli.sensor.intervals import find_intervals
-from accelcal_cli.sensor.spans import Rows
-from accelcal_cli.sensor.static import find_level
-from accelcal_cli.sensor.tiles import Tiles
+from accelcal_cli.detection.detect import DetectSettings, TooFewPosesError, detect
+from accelcal_cli.detection.intervals import find_intervals, find_level
+from accelcal_cli.detection.rawlog import Clock
+from accelcal_cli.detection.windows import Gaps, Limit, Rows, Tiles
 
 ROWS = Rows(tile=10, width=10, still=None, least=100, trim=50)
 LOG, HOLDS = simulated(gyro=False)
@@ -70,7 +67,7 @@ def test_the_size_of_the_blocks_changes_no_gap(sizes):
 def test_blocks_of_the_store_change_no_gap(monkeypatch):
     numbers = late(START + 205, 50.0)
     whole, _ = found(numbers)
-    monkeypatch.setattr("accelcal_cli.sensor.tiles.BLOCK", 37)
+    monkeypatch.setattr("accelcal_cli.detection.windows.BLOCK", 37)
     np.testing.assert_array_equal(found(numbers)[0].start, whole.start)
 
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, direct_cost, noise, rotation
 
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import GAUGES, ErrorModel, to_gauge
-from accelcal_cli.streams import Streams
 
 ABOVE, BELOW = np.triu_indices(3, 1), np.tril_indices(3, -1)
 

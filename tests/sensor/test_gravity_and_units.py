@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import UsageError
-from accelcal_cli.sensor import units
+from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.gravity import check_gravity, normal_gravity
 
 

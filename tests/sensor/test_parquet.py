@@ -11,8 +11,8 @@ import polars as pl
 import pytest
 
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor import parquet
-from accelcal_cli.sensor.readings import read_readings
+from accelcal_cli.io import parquet
+from accelcal_cli.io.readings import read_readings
 
 ROWS = np.random.default_rng(5).normal(size=(1000, 3))
 

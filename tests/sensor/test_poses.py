@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from accelcal_cli.calibration.quality import Observability, design
+from accelcal_cli.calibration.observability import Observability, design
 from accelcal_cli.errors import UsageError
+from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
-from accelcal_cli.streams import Streams
 
 
 def _rank(u):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from raw_logs import opened, simulated, text
 
+from accelcal_cli.detection.rawlog import Clock, unit_of
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor.clock import Clock, unit_of
 
 LOG, _ = simulated(2, hold=4.0)
 A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]
@@ -172,7 +172,7 @@ def test_dates_that_go_back_are_named():
 def test_dates_in_parquet(tmp_path):
     import polars
 
-    from accelcal_cli.sensor.rawlog import open_raw_log
+    from accelcal_cli.detection.rawlog import open_raw_log
 
     start = np.datetime64("2026-02-28T23:59:58.500000", "us")
     frame = polars.DataFrame(A, schema=["ax", "ay", "az"]).with_columns(
@@ -218,7 +218,7 @@ def test_a_bad_cell_is_named():
 def test_parquet_reads_as_text_does(tmp_path):
     import polars
 
-    from accelcal_cli.sensor.rawlog import open_raw_log
+    from accelcal_cli.detection.rawlog import open_raw_log
 
     path = tmp_path / "log.parquet"
     polars.DataFrame(np.hstack([T, A]), schema=["t", "ax", "ay", "az"]).write_parquet(path)

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor import collect, spool
-from accelcal_cli.sensor.readings import Readings, read_readings
+from accelcal_cli.io import readings as collect
+from accelcal_cli.io import stream as spool
+from accelcal_cli.io.readings import Readings, read_readings
 
 GOOD = "ax,ay,az\n1,2,3\n4,5,6\n7,8,9.5\n"
 
@@ -224,7 +225,7 @@ def test_small_files_do_without_polars(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(GOOD)
     code = (
-        "import sys; from accelcal_cli.sensor.readings import read_readings; "
+        "import sys; from accelcal_cli.io.readings import read_readings; "
         f"read_readings({str(path)!r}); sys.exit('polars' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

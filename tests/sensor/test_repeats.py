@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor import repeats
-from accelcal_cli.sensor.repeats import LabelledMeans
+from accelcal_cli.io import readings as repeats
+from accelcal_cli.io.readings import LabelledMeans
 
 
 @settings(max_examples=100, deadline=None)

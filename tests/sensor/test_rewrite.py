@@ -10,12 +10,12 @@ import polars as pl
 import pytest
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor import rewrite as module
-from accelcal_cli.sensor.cells import Selection
-from accelcal_cli.sensor.columns import choose
-from accelcal_cli.sensor.rewrite import Change, rewrite
-from accelcal_cli.sensor.source import ByteSource
-from accelcal_cli.sensor.tabular import TextTable, open_table
+from accelcal_cli.io import rewrite as module
+from accelcal_cli.io.columns import choose
+from accelcal_cli.io.reader import TextTable, open_table
+from accelcal_cli.io.rewrite import Change, rewrite
+from accelcal_cli.io.stream import ByteSource
+from accelcal_cli.io.text import Selection
 
 
 def third(numbers):
@@ -205,8 +205,8 @@ def parquet(tmp_path):
 @pytest.mark.parametrize("replace", [True, False])
 @pytest.mark.parametrize("rows", [20, 500_000])
 def test_parquet_to_parquet_and_to_text(parquet, replace, rows, tmp_path, monkeypatch):
-    from accelcal_cli.sensor import parquet as reader
-    from accelcal_cli.sensor.rewrite_parquet import to_parquet, to_text
+    from accelcal_cli.io import parquet as reader
+    from accelcal_cli.io.parquet import to_parquet, to_text
 
     monkeypatch.setattr(reader, "ROWS", rows)
     path, frame = parquet
@@ -224,8 +224,8 @@ def test_parquet_to_parquet_and_to_text(parquet, replace, rows, tmp_path, monkey
 
 
 def test_a_wrong_value_in_parquet_is_named(tmp_path, monkeypatch):
-    from accelcal_cli.sensor import parquet as reader
-    from accelcal_cli.sensor.rewrite_parquet import to_parquet
+    from accelcal_cli.io import parquet as reader
+    from accelcal_cli.io.parquet import to_parquet
 
     monkeypatch.setattr(reader, "ROWS", 10)
     pl.DataFrame({"ax": [1.0] * 40, "ay": [2.0] * 40, "az": [3.0] * 34 + [None] * 6}).write_parquet(

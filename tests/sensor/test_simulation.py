@@ -8,7 +8,7 @@ from simulated import DPSO
 
 from accelcal_cli.config import load_mapping, load_sensor, shipped
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.registry import build
+from accelcal_cli.schema import build
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.simulation import Sensor, Spread, simulate
 

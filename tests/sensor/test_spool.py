@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.sensor.spool import RowStore
+from accelcal_cli.io.stream import RowStore
 
 
 @settings(max_examples=50, deadline=None)

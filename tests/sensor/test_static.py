@@ -10,12 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raw_logs import in_blocks, simulated
 
+from accelcal_cli.detection.intervals import Intervals, find_intervals, find_level, merge, windows
+from accelcal_cli.detection.windows import MOST, Envelope, Rows, Span, Spans, Tiles, parse_span
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor.envelope import MOST, Envelope
-from accelcal_cli.sensor.intervals import Intervals, find_intervals, merge
-from accelcal_cli.sensor.spans import Rows, Span, Spans, parse_span
-from accelcal_cli.sensor.static import find_level, windows
-from accelcal_cli.sensor.tiles import Tiles
 
 ROWS = Rows(tile=10, width=10, still=None, least=100, trim=50)
 
@@ -106,7 +103,7 @@ def test_several_multipliers_agree_with_each_alone():
 def test_blocks_of_the_store_change_nothing(monkeypatch):
     """Tiles are read back in blocks as well; runs and intervals go over their borders."""
     (whole,) = found(tiled(LOG))
-    monkeypatch.setattr("accelcal_cli.sensor.tiles.BLOCK", 37)
+    monkeypatch.setattr("accelcal_cli.detection.windows.BLOCK", 37)
     (parts,) = found(tiled(LOG))
     np.testing.assert_array_equal(whole.intervals.start, parts.intervals.start)
     np.testing.assert_array_equal(whole.intervals.end, parts.intervals.end)

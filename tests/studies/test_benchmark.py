@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.studies import ranks
+from accelcal_cli.studies import benchmark as ranks
 from accelcal_cli.studies.benchmark import Benchmark, curves, summary
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.entries import Budget, choose, words

@@ -7,17 +7,24 @@ import dataclasses
 import numpy as np
 import pytest
 
-from accelcal_cli.calibration.lotters import pack
+from accelcal_cli.calibration.problem import pack
 from accelcal_cli.config import load_sensor
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.optimizers.base import OPTIMIZERS
-from accelcal_cli.sensor.readings import Readings, read_readings
+from accelcal_cli.io.readings import Readings, read_readings
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.sensor.simulation import draw
-from accelcal_cli.studies.compare import Comparison, curves
+from accelcal_cli.studies.compare import Comparison, curves, succeeded, summary
 from accelcal_cli.studies.engine import Journal, run_study
-from accelcal_cli.studies.estimates import errors, in_lower, limit
-from accelcal_cli.studies.outcome import succeeded, summary
-from accelcal_cli.studies.scene import BoxSettings, Recording, Search, Simulation, starting_points
+from accelcal_cli.studies.scenarios import (
+    BoxSettings,
+    Recording,
+    Search,
+    Simulation,
+    errors,
+    in_lower,
+    limit,
+    starting_points,
+)
 from accelcal_cli.studies.study import Entry
 
 G = 9.80665

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from accelcal_cli.errors import DataError, OutputError
-from accelcal_cli.output.raw import write_raw
+from accelcal_cli.output.machine import write_raw
 from accelcal_cli.studies import engine, pools
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.engine import Journal, run_study

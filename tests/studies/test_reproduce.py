@@ -9,9 +9,9 @@ import pytest
 
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.studies import reproduce
-from accelcal_cli.studies.devices import parameters, valley
+from accelcal_cli.studies.compare import parameters, valley
 from accelcal_cli.studies.engine import Journal, run_study
-from accelcal_cli.studies.experiment import PaperTable, Part
+from accelcal_cli.studies.reproduce import PaperTable, Part
 from accelcal_cli.studies.study import Entry, Task, raw_table
 from accelcal_cli.table import Column, Table
 

@@ -1,0 +1,12 @@
+"""The array types of the whole house: numbers, indices, truth values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.floating[Any]]
+Int = NDArray[np.intp]
+Bool = NDArray[np.bool_]

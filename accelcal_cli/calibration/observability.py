@@ -1,0 +1,285 @@
+"""How well the poses determine the parameters: information, dilution of precision, verdict.
+
+Nine parameters, all as specific force in m/s^2 and always in gauge `lower`: g times the entries of the
+lower-triangular E in K_A = (I + E) K_A0, and K_A0's diagonal times the bias. Their residuals are
+e_j = (g^2 - |f_j|^2) / 2g. The dilution of precision of a parameter is the square root of its entry in
+(J^T J)^-1: how many times the noise of one pose its error comes out. It depends on the poses alone.
+
+Which poses of a log have the same attitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.calibration.problem import ROWS_COLUMNS, Loetters, pack
+from accelcal_cli.sensor.model import ErrorModel
+
+PARAMETERS = (
+    "scale factor x",
+    "scale factor y",
+    "scale factor z",
+    "misalignment xy",
+    "misalignment xz",
+    "misalignment yz",
+    "bias x",
+    "bias y",
+    "bias z",
+)
+SCALE, MISALIGNMENT, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+
+WEAK, UNDETERMINED = 10.0, 25.0
+"""Thresholds of the dilution of precision. Of 16 real pose sets those with usable parameters stayed below 9.4;
+those with an excellent residual and useless parameters had 25 to 1850."""
+
+RANK_TOLERANCE = 1e-12
+"""An eigenvalue of the information below this part of the largest is zero: double precision's square root of
+it, 1e-6, is the smallest relative difference between poses that an ordinary CSV file can carry."""
+
+ALIGNED = np.repeat([False, True, False], 3)
+"""The parameters that are not estimated when the axes are taken as perpendicular."""
+
+Verdict = Literal["good", "weak", "undetermined"]
+
+
+def design(u: Float) -> Float:
+    """Return d e / d parameters, shape (..., J, 9), for unit directions u of the specific force, shape (..., J, 3)."""
+    pairs = [u[..., i] * u[..., j] for i, j in ROWS_COLUMNS[:6]]
+    return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
+
+
+def verdict_of(worst: float, rank: int) -> Verdict:
+    """Return the verdict on poses that determine `rank` directions, with this largest dilution of precision."""
+    if rank < 9 or worst > UNDETERMINED:
+        return "undetermined"
+    return "weak" if worst > WEAK else "good"
+
+
+CERTAIN = 1e6
+"""Information, in poses, that stands for knowing a parameter."""
+
+
+def knowing(information: Float, held: Bool) -> Float:
+    """Return information, shape (9, 9), to which that of knowing some parameters, shape (9,), is added."""
+    known: Float = information + CERTAIN * np.diag(held.astype(float))
+    return known
+
+
+PRIOR = 1e-6
+"""Information that physics lends to every parameter when it comes to naming the undetermined ones: none is off by
+more than 1000 times the noise of a pose. Without it a direction that the poses say nothing of would take every
+parameter along that it touches by a part in a thousand."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """What a set of poses says about the nine parameters.
+
+    Attributes:
+        cofactor: (J^T J)^-1, its pseudo-inverse when the rank is below nine, shape (9, 9).
+        dop: dilution of precision of each parameter, shape (9,); inf where the poses do not determine it.
+        bounded: the same under the prior, at most 1000, shape (9,): it names what is not determined.
+        rank: number of determined directions, at most 9.
+    """
+
+    cofactor: Float
+    dop: Float
+    bounded: Float
+    rank: int
+
+    @classmethod
+    def of(cls, information: Float, poses: int, held: Bool | None = None) -> Observability:
+        """Return the observability of an information matrix J^T J, shape (9, 9), from `poses` poses.
+
+        `held` parameters, shape (9,), are known and not estimated.
+        """
+        return Observabilities.of(information[None], np.array([poses]), held).one(0)
+
+    @property
+    def worst(self) -> float:
+        """The largest dilution of precision."""
+        return float(self.dop.max())
+
+    @property
+    def verdict(self) -> Verdict:
+        """Definition: undetermined above 25 or below rank 9, weak above 10, good otherwise."""
+        return verdict_of(self.worst, self.rank)
+
+    def above(self, limit: float) -> list[str]:
+        """Return the names of the parameters whose bounded dilution of precision is above `limit`, worst first."""
+        order = np.argsort(-np.round(self.bounded, 3), kind="stable")
+        return [PARAMETERS[i] for i in order if self.bounded[i] > limit]
+
+
+@dataclass(frozen=True, eq=False)
+class Observabilities:
+    """What R sets of poses say about the parameters; see `Observability`.
+
+    Attributes:
+        cofactor: shape (R, 9, 9); dop, bounded: shape (R, 9); rank: shape (R,).
+    """
+
+    cofactor: Float
+    dop: Float
+    bounded: Float
+    rank: Int
+
+    @classmethod
+    def of(cls, information: Float, poses: Int, held: Bool | None = None) -> Observabilities:
+        """Return the observability of matrices J^T J, shape (R, 9, 9), from so many poses, shape (R,).
+
+        `held` parameters, shape (9,), are known and not estimated: they have no error.
+        """
+        if held is not None and held.any():
+            return cls._of_free(information, poses, np.flatnonzero(~held))
+        values, vectors = np.linalg.eigh(information)
+        transposed = vectors.swapaxes(1, 2)
+        known = values > RANK_TOLERANCE * values[:, -1:]
+        inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
+        cofactor = (vectors * inverse[:, None]) @ transposed
+        # The square sum of a row of the eigenvectors, each weighted, is what stands in the diagonal.
+        bounded = np.sqrt((vectors**2 @ (1.0 / (np.maximum(values, 0.0) + PRIOR))[..., None])[..., 0])
+        dop = np.sqrt(np.einsum("rpp->rp", cofactor))
+        whole = known.all(axis=1, keepdims=True)
+        dop = np.where(whole, dop, np.where(bounded > UNDETERMINED, np.inf, bounded))
+        return cls(cofactor, dop, bounded, np.minimum(known.sum(axis=1), poses))
+
+    @classmethod
+    def _of_free(cls, information: Float, poses: Int, free: Int) -> Observabilities:
+        """Return the observability of the parameters at `free`, the others without error."""
+        seen = cls.of(information[:, free[:, None], free], poses)
+        cofactor = np.zeros_like(information)
+        cofactor[:, free[:, None], free] = seen.cofactor
+        dop, bounded = np.zeros((2, *information.shape[:2]))
+        dop[:, free], bounded[:, free] = seen.dop, seen.bounded
+        return cls(cofactor, dop, bounded, seen.rank + 9 - len(free))
+
+    def one(self, index: int) -> Observability:
+        """Return what the set of poses number `index` says."""
+        return Observability(
+            self.cofactor[index], self.dop[index], self.bounded[index], int(self.rank[index])
+        )
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """Return the verdict on every set of poses."""
+        return [verdict_of(*pair) for pair in zip(self.dop.max(axis=1), self.rank, strict=True)]
+
+
+def jacobian(problem: Loetters, x: Float) -> Float:
+    """Return d (-e) / d parameters of the compressed residuals, shape (R, 11, 9), at x, shape (R, 9).
+
+    The chain runs over K_a = K_a0 (I + E)^-1, so dK_a = -K_a0 E, and dD_i = K_ii times the bias as force.
+    """
+    K, _ = problem.parameters(x)
+    chain = np.zeros((len(K), 9, 9))
+    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+        change = np.zeros_like(K)
+        change[:, :, j] = -K[:, :, i] / problem.g
+        chain[:, :, p] = pack(change, np.zeros((len(K), 3)), 9)
+    for i in range(3):
+        chain[:, 6 + i, 6 + i] = K[:, i, i]
+    result: Float = problem.jacobian(x[:, None])[:, 0] / problem.units[:, None, :] @ chain / (2.0 * problem.g)
+    return result
+
+
+def information(problem: Loetters, x: Float) -> Float:
+    """Return J^T J of the nine parameters, shape (R, 9, 9), at x, shape (R, 9), from the compressed readings."""
+    J = jacobian(problem, x)
+    result: Float = J.swapaxes(1, 2) @ J
+    return result
+
+
+def in_words(seen: Observability, suggestions: Sequence[str]) -> tuple[str, ...]:
+    """Return the verdict in plain sentences: what is not determined, what is weak, and what would mend it."""
+    lines = []
+    lost = seen.above(UNDETERMINED)
+    if lost:
+        lines.append(f"The poses do not determine: {', '.join(lost)}.")
+    elif seen.rank < 9:
+        lines.append("The poses do not determine all nine parameters.")
+    weak = [name for name in seen.above(WEAK) if name not in lost]
+    if weak:
+        lines.append(f"Weakly determined: {', '.join(weak)}.")
+    if lines and suggestions:
+        lines.append("Poses that would mend it: " + "; ".join(suggestions) + ".")
+    return tuple(lines)
+
+
+def directions_of(output: Float, model: ErrorModel) -> Float:
+    """Return the unit directions of the specific force of outputs, both shape (J, 3)."""
+    force = model.specific_force(output)
+    unit: Float = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
+    return unit
+
+
+def attitudes(u: Float, n: NDArray[np.int64], angle: float) -> list[Int]:
+    """Group directions: the longest pose that is left takes all within `angle`, until none is left.
+
+    Args:
+        u: unit directions, shape (J, 3); n: rows of each pose, shape (J,).
+        angle: degrees.
+
+    Returns:
+        Indices of each group, its longest pose first.
+    """
+    left = np.argsort(-n, kind="stable")
+    limit = np.cos(np.radians(angle))
+    groups = []
+    while len(left):
+        near = u[left] @ u[left[0]] >= limit
+        near[0] = True
+        groups.append(left[near])
+        left = left[~near]
+    return groups
+
+
+SUM_WEIGHT = 1e-3
+"""Weight of the sum of the variances beside the largest one: it decides between sets alike in the largest."""
+
+
+DIGITS = 9
+"""Decimals of a score: rounding decides between equal candidates otherwise, and with it the machine."""
+
+
+def next_poses(
+    information: Float, candidates: Float, count: int, enough: float = 0.0, least: int = 0
+) -> list[int]:
+    """Return the indices of up to `count` candidates, greedily chosen, best first.
+
+    Args:
+        information: J^T J of the poses so far, shape (9, 9); zeros when there are none.
+        candidates: unit directions to choose from, shape (C, 3); one may be chosen again.
+        count: how many to choose.
+        enough: stop when the worst dilution of precision is at or below this, but not before `least` are chosen.
+
+    Each choice minimises the largest variance after it; the variances after a candidate a follow from the
+    rank-one update P - P a a^T P / (1 + a^T P a). Ties go to the smallest sum of variances.
+    """
+    rows = design(candidates)
+    cofactor = np.linalg.inv(information + PRIOR * np.eye(9))
+    chosen: list[int] = []
+    while len(chosen) < count and (len(chosen) < least or np.diagonal(cofactor).max() > enough**2):
+        gain = rows @ cofactor
+        drop = gain**2 / (1.0 + np.einsum("cp,cp->c", gain, rows))[:, None]
+        after = np.diagonal(cofactor) - drop
+        best = int(np.argmin(_score(after, np.inf)))
+        chosen.append(best)
+        cofactor = cofactor - np.outer(gain[best], gain[best]) / (1.0 + gain[best] @ rows[best])
+    return chosen
+
+
+def _score(variances: Float, power: float) -> Float:
+    """Return the logarithm of a norm of variances, shape (..., 9), and a little of their sum."""
+    largest = variances.max(axis=-1)
+    score = np.log(largest)
+    if np.isfinite(power):
+        score = score + np.log(((variances / largest[..., None]) ** power).sum(axis=-1)) / power
+    total = SUM_WEIGHT * np.log(variances.sum(axis=-1))
+    return np.asarray(np.round(np.round(score, DIGITS) + total, DIGITS))

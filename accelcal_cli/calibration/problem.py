@@ -1,0 +1,444 @@
+"""The calibration problem: Loetters' modulus observation as a least-squares cost over a box.
+
+    L(theta) = sum_j (g^2 - |f_j|^2)^2,   f_j = K_a^-1 (N_j - D_a)          [dpso2014] eq. 15
+
+Everything is done in normalised coordinates x = (N - c) / s and in units of g, where |f| / g = |A (x - d)|
+with A = (K_a g / s)^-1 and d = (D_a - c) / s. There |f|^2 / g^2 = h^T Q h with h = (x, 1) and Q = M^T M,
+M = [A | -A d]: the residual is linear in the 10 entries of Q, so one QR of the readings' rows leaves an 11 x 11
+triangle that holds the cost of 12 readings or of 12 million exactly (calibration.compress).
+
+Readings compressed to an 11 x 11 triangle whose cost is theirs, exactly.
+
+With x = (N - c) / s and h = (x, 1), |f|^2 / g^2 = h^T Q h is linear in the ten entries of Q. Stacking the rows
+[phi(x_j), 1] and taking the R of their QR keeps sum_j (1 - phi_j . q)^2 = |R [q; -1]|^2 for every Q. QR of stacked
+blocks composes (TSQR), so readings of any number pass through in blocks; a weight multiplies its row.
+
+The closed form: readings lie on an ellipsoid, and a linear fit finds it.
+
+x^T A x + 2 m^T x + d = 0 with trace(A) = 3, nine unknowns by linear least squares. A free constant term instead
+of the trace condition would admit the trivial minimum. The centre is the bias, A's Cholesky factor the matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.optimization.problem import Problem
+
+ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
+"""Which K_ij each unknown is: diagonal, below it, above it (the last three in gauge `full` alone)."""
+
+AROUND = {
+    n + 1: np.array([positions.get((i % 3, j % 3), n) for i in range(5) for j in range(5)])
+    for n in (6, 9, 12)
+    for positions in [{place: k for k, place in enumerate(ROWS_COLUMNS[: n - 3])}]
+}
+"""Which row of n unknowns and a zero each entry of the 5 x 5 table is that holds K going round, by n + 1."""
+
+
+def pack(K: Float, D: Float, unknowns: int) -> Float:
+    """Return the unknowns, shape (..., 6, 9 or 12), of K, shape (..., 3, 3), and D, shape (..., 3)."""
+    rows, columns = zip(*ROWS_COLUMNS[: unknowns - 3], strict=True)
+    return np.concatenate([K[..., rows, columns], D], axis=-1)
+
+
+def unpack(theta: Float) -> tuple[Float, Float]:
+    """Return K, shape (..., 3, 3), and D, shape (..., 3), of the unknowns, shape (..., 6, 9 or 12)."""
+    K = np.zeros((*theta.shape[:-1], 3, 3))
+    rows, columns = zip(*ROWS_COLUMNS[: theta.shape[-1] - 3], strict=True)
+    K[..., rows, columns] = theta[..., :-3]
+    return K, theta[..., -3:]
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The search box in the units of the readings.
+
+    Attributes:
+        centre: nominal unknowns (K_11 K_22 K_33 [K_21 K_31 K_32 [K_12 K_13 K_23]] D_1 D_2 D_3), shape (R, D).
+        half: half-widths, same shape.
+    """
+
+    centre: Float
+    half: Float
+
+    def take(self, index: Int) -> Box:
+        """Return the boxes of the sensors at `index`."""
+        return Box(self.centre[index], self.half[index])
+
+
+class Loetters(Problem):
+    """The cost of one sensor, or of R sensors at once, over u in [-1, 1]^D.
+
+    Args:
+        triangle: compressed readings, with leading axis R when the runs are different sensors.
+        g: local gravity, m/s^2.
+        box: centre and half-widths; D = 6 (diagonal K_a), 9 (lower-triangular) or 12 (full).
+    """
+
+    has_residuals = True
+    has_closed_form = True
+    minimum = None
+
+    def __init__(self, triangle: Triangle, g: float, box: Box) -> None:
+        """Bring box and readings to normalised coordinates."""
+        self.name = "Loetters"
+        self.triangle, self.g, self.box = triangle, g, box
+        self.unknowns = box.centre.shape[-1]
+        self.lower, self.upper = -np.ones(self.unknowns), np.ones(self.unknowns)
+        # Units of the unknowns in one normalised unit: K is per m/s^2, so K g / s; D is D / s, off centre.
+        unit = np.concatenate([np.full(self.unknowns - 3, 1.0 / g), np.ones(3)])
+        shift = np.zeros((len(triangle.scale), self.unknowns))
+        shift[:, -3:] = triangle.centre
+        self._centre = (box.centre - shift) / (unit * triangle.scale[:, None])
+        self._half = box.half / (unit * triangle.scale[:, None])
+        self._triangle = triangle.R * g**2  # residuals in (m/s^2)^2
+        self._R = self._triangle[..., :10]
+
+    @property
+    def units(self) -> Float:
+        """How much of each unknown's own unit one unit of u is, shape (R, D): the half-widths of the box."""
+        return self.box.half
+
+    def cost(self, x: Float) -> Float:
+        """Return L in (m/s^2)^4, shape (R, P)."""
+        r = self._triangle @ self._quadratic(x)
+        r *= r
+        cost: Float = np.add.reduce(r, axis=1)
+        return cost
+
+    def residuals(self, x: Float) -> Float:
+        """Return the 11 compressed residuals in (m/s^2)^2, shape (R, P, 11)."""
+        r: Float = self._triangle @ self._quadratic(x)
+        return r.transpose(0, 2, 1)
+
+    def jacobian(self, x: Float) -> Float:
+        """Return d residual / d u in (m/s^2)^2, shape (R, P, 11, D).
+
+        From dA = -A dK A and dM = [dA | -dA d - A dd], column by column.
+        """
+        K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
+        A = _inverse(K)
+        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)  # dM for dK_ij is -A e_i (row j of M)
+        columns = []
+        for i, j in ROWS_COLUMNS[: self.unknowns - 3]:
+            columns.append(_quadratic_change(M, -A[..., :, i, None] * M[..., j, None, :]))
+        for i in range(3):
+            change = np.zeros_like(M)
+            change[..., 3] = -A[..., :, i]
+            columns.append(_quadratic_change(M, change))
+        q = np.stack(columns, axis=-1) * self._half[:, None, None]
+        jacobian: Float = self._R[:, None] @ q
+        return jacobian
+
+    @property
+    def groups(self) -> Int:
+        """Scale factors 0, misalignments 1, biases 2."""
+        return np.repeat([0, 1, 2], [3, self.unknowns - 6, 3])
+
+    def gradient_hessian(self, x: Float) -> tuple[Float, Float]:
+        """Return the gradient, shape (R, P, D), and full Hessian of L, (R, P, D, D), at x, shape (R, P, D).
+
+        grad L = 2 J^T r, H = 2 J^T J + 2 sum_k r_k d2 r_k. The residuals are linear in q = vech(M^T M), so the second
+        part is the Hessian of <Y, M^T M> with Y from R^T r. With dM = -A W, W = dK M + (0 | dd), it is
+        2 <A W Y, A W> + 4 <M Y, A dK A W> as a quadratic form.
+        """
+        J, r = self.jacobian(x), self.residuals(x)
+        K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
+        A = _inverse(K)
+        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)
+        Y = _symmetric((self._R.swapaxes(1, 2)[:, None] @ r[..., None])[..., 0])
+        dK = np.zeros((self.unknowns, 3, 3))
+        dd = np.zeros((self.unknowns, 3, 4))
+        for p, (i, j) in enumerate(ROWS_COLUMNS[: self.unknowns - 3]):
+            dK[p, i, j] = 1.0
+        dd[-3:, :, 3] = np.eye(3)
+        AW = A[..., None, :, :] @ (dK @ M[..., None, :, :] + dd)  # (R, P, D, 3, 4)
+        AdK = A[..., None, :, :] @ dK
+        curvature = np.einsum("rpaik,rpkl,rpbil->rpab", AW, Y, AW)
+        mixed = np.einsum("rpik,rpaij,rpbjk->rpab", M @ Y, AdK, AW)
+        second = 2.0 * curvature + 2.0 * (mixed + mixed.swapaxes(2, 3))
+        half = self._half[:, None, :]
+        hessian = 2.0 * J.swapaxes(2, 3) @ J + 2.0 * second * half[..., :, None] * half[..., None, :]
+        gradient = 2.0 * (J.swapaxes(2, 3) @ r[..., None])[..., 0]
+        return gradient, hessian
+
+    def closed_form(self) -> Float:
+        """Return the ellipsoid fit in box coordinates, shape (R, D); NaN where the readings fix no ellipsoid."""
+        K, d = fit_ellipsoid(self.triangle)
+        return (pack(K, d, self.unknowns) - self._centre) / self._half
+
+    def take(self, index: Int) -> Loetters:
+        """Return the problem of the sensors at `index`; itself when all runs share one sensor."""
+        if len(self.triangle.scale) == 1:
+            return self
+        return self.of(index)
+
+    def of(self, index: Int) -> Loetters:
+        """Return the problem of the sensors at `index`, which are sensors of their own even where there is one."""
+        return Loetters(self.triangle.take(index), self.g, self.box.take(index))
+
+    def parameters(self, x: Float) -> tuple[Float, Float]:
+        """Return K_a, shape (R, 3, 3), and D_a, shape (R, 3), in the readings' units at x, shape (R, D)."""
+        return unpack(self.box.centre + self.box.half * x)
+
+    def coordinates(self, K: Float, D: Float) -> Float:
+        """Return the point of the box, shape (R, D), at K_a, shape (R, 3, 3), and D_a, shape (R, 3)."""
+        return (pack(K, D, self.unknowns) - self.box.centre) / self.box.half
+
+    def _quadratic(self, x: Float) -> Float:
+        """Return the ten entries of Q = M^T M and -1, shape (R, 11, P), at x, shape (R, P, D)."""
+        # The last row, of zeros, is what is above the diagonal of a lower-triangular K.
+        theta = np.zeros((len(x), self.unknowns + 1, x.shape[1]))
+        unknowns = theta[:, :-1]
+        np.multiply(self._half[..., None], x.transpose(0, 2, 1), out=unknowns)
+        unknowns += self._centre[..., None]
+        M = _columns(theta)
+        first, second = PAIRS
+        products = M.take(first, axis=1)
+        products *= M.take(second, axis=1)
+        q = np.empty((len(x), 11, x.shape[1]))
+        np.add.reduce(products, axis=2, out=q[:, :10])
+        q[:, 10] = -1.0
+        return q
+
+
+def _inverse(K: Float) -> Float:
+    """Return K^-1, shape (..., 3, 3); NaN where K is singular, so that one run's fate is not that of the batch."""
+    with suppress(np.linalg.LinAlgError):
+        return np.linalg.inv(K)
+    regular = (np.linalg.det(K) != 0)[..., None, None]
+    return np.where(regular, np.linalg.inv(np.where(regular, K, np.eye(3))), np.nan)
+
+
+def _quadratic_change(M: Float, dM: Float) -> Float:
+    """Return d vech(M^T M), shape (R, P, 10), for a change dM of M, both (R, P, 3, 4)."""
+    change = dM.swapaxes(-1, -2) @ M
+    first, second = PAIRS
+    return change[..., first, second] + change[..., second, first]
+
+
+def _symmetric(y: Float) -> Float:
+    """Return the symmetric Y, shape (..., 4, 4), with <Y, Q> = y . q for q = vech(Q), shape (..., 10).
+
+    The rows phi carry the factor 2 of the off-diagonals, so Y holds y halved there.
+    """
+    Y = np.zeros((*y.shape[:-1], 4, 4))
+    first, second = PAIRS
+    Y[..., first, second] += 0.5 * y
+    Y[..., second, first] += 0.5 * y
+    return Y
+
+
+def _columns(theta: Float) -> Float:
+    """Return the columns of M = [A | -A d], shape (R, 4, 3, P), by cofactors: A_ji det K = C_ij.
+
+    C_ij = K_i+1,j+1 K_i+2,j+2 - K_i+1,j+2 K_i+2,j+1 with the indices of K going round: C is cut out of a 5 x 5
+    table that holds K going round.
+    """
+    runs, rows, population = theta.shape
+    K = theta.take(AROUND[rows], axis=1).reshape(runs, 5, 5, population)
+    M = np.empty((runs, 4, 3, population))
+    # M[:, j, i] is entry (i, j) of M, so that its first three columns, transposed, are the cofactors over det K.
+    A, shift = M[:, :3], M[:, 3]
+    np.multiply(K[:, 1:4, 1:4], K[:, 2:, 2:], out=A)
+    A -= K[:, 1:4, 2:] * K[:, 2:, 1:4]
+    A /= np.add.reduce(K[:, 0, :3] * A[:, 0], axis=1)[:, None, None]
+    np.add.reduce(A * theta[:, -4:-1, None], axis=1, out=shift)
+    np.negative(shift, out=shift)
+    return M
+
+
+PAIRS = (np.array([0, 1, 2, 0, 0, 1, 0, 1, 2, 3]), np.array([0, 1, 2, 1, 2, 2, 3, 3, 3, 3]))
+"""Which entries of the symmetric 4 x 4 matrix Q the vector q holds."""
+
+PIECE = 512
+"""Rows of one small QR; LAPACK's panel of 512 x 11 stays in the first-level cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triangle:
+    """The compressed readings of R sensors.
+
+    Attributes:
+        R: upper triangles, shape (R, 11, 11), of the rows [phi(x), 1].
+        centre: c, shape (R, 3), output units.
+        scale: s, shape (R,), output units.
+        poses: J, the number of readings of each sensor, shape (R,).
+    """
+
+    R: Float
+    centre: Float
+    scale: Float
+    poses: Int
+
+    def take(self, index: Int) -> Triangle:
+        """Return the triangles of the sensors at `index`."""
+        return Triangle(self.R[index], self.centre[index], self.scale[index], self.poses[index])
+
+
+def rows(x: Float) -> Float:
+    """Return [phi(x), 1], shape (..., J, 11), for normalised readings x, shape (..., J, 3).
+
+    Written column by column into memory of shape (..., 11, J): products of contiguous columns.
+    """
+    h = np.ascontiguousarray(x.swapaxes(-1, -2))
+    out = np.empty((*x.shape[:-2], 11, x.shape[-2]))
+    for k in range(3):
+        np.multiply(h[..., k, :], h[..., k, :], out=out[..., k, :])
+        np.multiply(h[..., k, :], 2.0, out=out[..., 6 + k, :])
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        np.multiply(out[..., 6 + i, :], h[..., j, :], out=out[..., 3 + k, :])
+    out[..., 9:, :] = 1.0
+    return out.swapaxes(-1, -2)
+
+
+def compress(blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale: float) -> Triangle:
+    """Compress one sensor's readings.
+
+    Args:
+        blocks: pairs of readings, shape (B, 3) in output units, and their weights, shape (B,), or None.
+        centre: c, shape (3,); scale: s. Any values serve; near the middle and the radius of the readings they
+            keep the arithmetic free of cancellation.
+    """
+    R: Float = np.zeros((11, 11))
+    poses = 0
+    for block, weight in blocks:
+        poses += len(block)
+        table = rows((block - centre) / scale)
+        if weight is not None:
+            table *= np.sqrt(weight)[:, None]
+        R = _triangle(np.concatenate([R, _pieces(table)]))
+    return Triangle(R[None], np.asarray(centre)[None], np.array([scale]), np.array([poses]))
+
+
+def compress_each(readings: Float, weights: Float | None = None, poses: Int | None = None) -> Triangle:
+    """Compress the readings of R sensors with J poses each, shape (R, J, 3), weights (R, J) or None.
+
+    Sensors with fewer poses repeat one of them with weight zero; `poses`, shape (R,), says how many there are.
+    """
+    low, high = readings.min(axis=1), readings.max(axis=1)
+    centre, scale = 0.5 * (low + high), 0.5 * (high - low).max(axis=1)
+    table = rows((readings - centre[:, None]) / scale[:, None, None])
+    if weights is not None:
+        table *= np.sqrt(weights)[..., None]
+    if table.shape[1] < 11:
+        table = np.concatenate([table, np.zeros((len(table), 11 - table.shape[1], 11))], axis=1)
+    each = np.full(len(readings), readings.shape[1]) if poses is None else poses
+    return Triangle(_triangle(table), centre, scale, each)
+
+
+def _pieces(table: Float) -> Float:
+    """Return rows with the same R as `table`, fewer by a factor PIECE / 11 when there are many."""
+    whole = len(table) // PIECE * PIECE
+    if whole <= PIECE:
+        return table
+    small = _triangle(table[:whole].reshape(-1, PIECE, 11)).reshape(-1, 11)
+    return np.concatenate([_pieces(small), table[whole:]])
+
+
+def _triangle(table: Float) -> Float:
+    """Return R of the QR of (..., rows >= 11, 11), shape (..., 11, 11)."""
+    R: Float = np.linalg.qr(table, mode="r")  # type: ignore[assignment]  # numpy types mode "r" as "reduced"
+    return R
+
+
+LARGEST_CONDITION = 4.0
+"""No accelerometer's axes differ by this factor: beyond it the fit describes the noise, not the sensor."""
+
+SMALLEST_PIVOT = 1e-9
+"""A pivot of the triangle below this part of the largest means a direction the poses say nothing of."""
+
+ROUNDS = 3
+"""Rounds towards the least cost: noise of 1e-3 g leaves a part of 1e-6 in each."""
+
+
+def fit_ellipsoid(triangle: Triangle) -> tuple[Float, Float]:
+    """Return K g / s in gauge `lower`, shape (R, 3, 3), and (D - c) / s, shape (R, 3).
+
+    NaN for a sensor whose readings do not determine an ellipsoid: fewer than nine poses, poses on a common other
+    quadric, or noise that makes the fitted quadric no ellipsoid.
+    """
+    phi = triangle.R[..., :10]
+    # trace(A) = 3 eliminates A_33 = 3 - A_11 - A_22.
+    left = np.concatenate([phi[..., :2] - phi[..., 2:3], phi[..., 3:]], axis=-1)
+    right = -3.0 * phi[..., 2]
+    q, r = np.linalg.qr(left)
+    pivots = np.abs(np.einsum("...ii->...i", r))
+    solvable = pivots.min(axis=-1) > SMALLEST_PIVOT * pivots.max(axis=-1)
+    r = np.where(solvable[:, None, None], r, np.eye(9))
+    z = np.linalg.solve(r, q.swapaxes(-1, -2) @ right[..., None])[..., 0]
+    A = np.empty((len(z), 3, 3))
+    A[:, 0, 0], A[:, 1, 1], A[:, 2, 2] = z[:, 0], z[:, 1], 3.0 - z[:, 0] - z[:, 1]
+    A[:, 0, 1] = A[:, 1, 0] = z[:, 2]
+    A[:, 0, 2] = A[:, 2, 0] = z[:, 3]
+    A[:, 1, 2] = A[:, 2, 1] = z[:, 4]
+    m, d = z[:, 5:8], z[:, 8]
+    values = np.linalg.eigvalsh(A)
+    solvable &= (values[:, 0] > 0) & (values[:, 2] < LARGEST_CONDITION**2 * values[:, 0])
+    A = np.where(solvable[:, None, None], A, np.eye(3))
+    centre = -np.linalg.solve(A, m[..., None])[..., 0]
+    level = -np.einsum("ri,ri->r", m, centre) - d  # c^T A c - d
+    solvable &= level > 0
+    shape = np.linalg.inv(A) * np.where(solvable, level, 1.0)[:, None, None]
+    K = np.linalg.cholesky(0.5 * (shape + shape.swapaxes(-1, -2)))
+    return np.where(solvable[:, None, None], K, np.nan), np.where(solvable[:, None], centre, np.nan)
+
+
+def least_squares(triangle: Triangle) -> tuple[Float, Float]:
+    """Return K g / s in gauge `lower`, shape (R, 3, 3), and (D - c) / s, shape (R, 3), at the least cost.
+
+    The rows' last two columns are both ones. With y the quadric x^T A x + 2 m^T x = 1 (A as it comes, not scaled to
+    the trace) the cost is L = F / (1 + e)^2, F = |T y - t|^2 + rho^2 and e = m^T A^-1 m, where T, t and rho are
+    the triangle's first nine columns, the tenth above its diagonal, and its diagonal there. Where its gradient
+    vanishes,
+
+        y = T^-1 t - F / (1 + e) (T^T T)^-1 phi(d),   d = -A^-1 m,
+
+    phi(d) the row of a reading at the centre d. F is the noise squared, so each round gains as many digits. NaN for
+    a sensor whose readings determine no ellipsoid; after much noise the rounds end before the last digits.
+    """
+    T, t, rho = triangle.R[:, :9, :9], triangle.R[:, :9, 9], triangle.R[:, 9, 9]
+    pivots = np.abs(np.einsum("rii->ri", T))
+    solvable = pivots.min(axis=1) > SMALLEST_PIVOT * pivots.max(axis=1)
+    inverse = np.linalg.inv(np.where(solvable[:, None, None], T, np.eye(9)))
+    first = _times(inverse, t)
+    y = first
+    with np.errstate(all="ignore"):
+        for _ in range(ROUNDS):
+            d, e = _centre(y)
+            F = rho**2 + np.sum(_times(T, y - first) ** 2, axis=1)
+            back = _times(inverse.swapaxes(1, 2), rows(d[:, None])[:, 0, :9])
+            y = first - (F / (1.0 + e))[:, None] * _times(inverse, back)
+        d, e = _centre(y)
+        A = _matrix(y) / (1.0 + e)[:, None, None]
+        values = np.linalg.eigvalsh(np.where(np.isfinite(A), A, 0.0))
+        solvable &= (
+            np.isfinite(A).all(axis=(1, 2)) & np.isfinite(d).all(axis=1) & (values[:, 0] > SMALLEST_PIVOT)
+        )
+    shape = np.linalg.inv(np.where(solvable[:, None, None], A, np.eye(3)))
+    K = np.linalg.cholesky(0.5 * (shape + shape.swapaxes(1, 2)))
+    return np.where(solvable[:, None, None], K, np.nan), np.where(solvable[:, None], d, np.nan)
+
+
+def _times(matrix: Float, vector: Float) -> Float:
+    product: Float = (matrix @ vector[..., None])[..., 0]
+    return product
+
+
+def _matrix(y: Float) -> Float:
+    """Return A, shape (R, 3, 3), of the quadrics y, shape (R, 9)."""
+    return y[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+
+
+def _centre(y: Float) -> tuple[Float, Float]:
+    """Return d = -A^-1 m, shape (R, 3), and m^T A^-1 m, shape (R,), by cofactors: a singular A gives inf or NaN."""
+    A, m = _matrix(y), y[:, 6:]
+    cofactors = np.stack([np.cross(A[:, k - 2], A[:, k - 1]) for k in range(3)], axis=2)
+    d: Float = -_times(cofactors, m) / np.sum(A[:, 0] * cofactors[..., 0], axis=1)[:, None]
+    return d, -np.sum(m * d, axis=1)

@@ -1,0 +1,1 @@
+"""Detection: static poses out of raw logs and live streams."""

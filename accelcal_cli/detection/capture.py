@@ -1,0 +1,221 @@
+"""Poses out of a live stream of readings: what is held, whether it is still, and what has been taken.
+
+Recognising a pose needs a rough sensor before there is a calibration: its output at no acceleration and for 1 g.
+What is not stated is estimated from the poses taken so far, as the sphere nearest to them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.sensor.model import check_unit
+
+STILL = 0.01
+"""Standard deviation of each axis, in parts of 1 g, at or below which a sensor counts as still."""
+
+NEAR = 20.0
+"""Degrees within which a pose counts as the planned one: faces, edges and corners are 35 or more apart."""
+
+SAME = 10.0
+"""Degrees within which a pose counts as one that has been taken."""
+
+SPHERE_PRIOR = 1e-3
+"""Information a pose lends to the origin as centre of the sphere, relative to its own."""
+
+SPHERE_ROUNDS = 3
+"""Steps towards the centre; each takes off more than nine tenths of the way, also from far outside the sphere."""
+
+
+State = Literal["moving", "still", "taken", "again"]
+
+
+@dataclass(frozen=True)
+class Held:
+    """A pose that was held still: n readings, their mean and standard deviation, shapes (3,), output units."""
+
+    n: int
+    mean: Float
+    spread: Float
+
+
+@dataclass(frozen=True)
+class Rough:
+    """A rough sensor, one scale factor for all axes.
+
+    Attributes:
+        centre: output at no acceleration, shape (3,).
+        scale: output of 1 g.
+    """
+
+    centre: Float
+    scale: float
+
+    def directions(self, output: Float) -> Float:
+        """Return the unit directions of outputs, shape (..., 3)."""
+        u = output - self.centre
+        length = np.linalg.norm(u, axis=-1, keepdims=True)
+        unit: Float = u / np.where(length > 0, length, 1.0)
+        return unit
+
+
+def rough_sensor(outputs: Float, scale: float | None, centre: Float | None) -> Rough:
+    """Return the rough sensor of some poses.
+
+    Args:
+        outputs: mean output of each pose, shape (J, 3), at least one.
+        scale: output of 1 g, when stated; centre: output at no acceleration, shape (3,), when stated.
+
+    Where the poses do not tell, the centre is the origin: a sensor whose output at no acceleration is several times
+    that of 1 g has to have its centre stated, or the first poses look alike.
+    """
+    if centre is None:
+        centre = np.zeros(3)
+        for _ in range(SPHERE_ROUNDS):
+            centre = centre + _towards_sphere(outputs - centre)
+    if scale is None:
+        scale = float(np.median(np.linalg.norm(outputs - centre, axis=1))) or 1.0
+    return Rough(centre, scale)
+
+
+def _towards_sphere(outputs: Float) -> Float:
+    """Return the step to the centre of the sphere nearest to some points, shape (J, 3).
+
+    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant; the prior holds what the points do not tell.
+    """
+    size = float(np.linalg.norm(outputs, axis=1).max()) or 1.0
+    x = outputs / size
+    left = np.column_stack([2.0 * x, np.ones(len(x))])
+    prior = SPHERE_PRIOR * len(x) * np.diag([1.0, 1.0, 1.0, 0.0])
+    c: Float = np.linalg.solve(left.T @ left + prior, left.T @ np.einsum("ij,ij->i", x, x))
+    return size * c[:3]
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the sensor is doing.
+
+    Attributes:
+        state: moving; still, and being averaged; taken, just now; again, a pose that has been taken.
+        spread: largest standard deviation of the three axes in the window, output units; limit: what counts as still.
+        progress: part of the hold that is done, 0 to 1.
+        nearest: number of the nearest planned pose; angle: degrees to it.
+    """
+
+    state: State
+    spread: float
+    limit: float
+    progress: float
+    nearest: int
+    angle: float
+
+
+class Capture:
+    """Watches a stream of readings and takes the poses that are held still."""
+
+    def __init__(
+        self,
+        planned: Float,
+        window: int,
+        hold: int,
+        still: float | None = None,
+        scale: float | None = None,
+        centre: Float | None = None,
+        unit: str | None = None,
+    ) -> None:
+        """Wait for poses.
+
+        Args:
+            planned: unit directions of the specific force, shape (P, 3).
+            window: readings that stillness is judged by; hold: still readings that make a pose.
+            still: largest standard deviation of a still axis, output units; 1 % of 1 g when None.
+            scale: output of 1 g; centre: output at no acceleration, shape (3,); estimated when None.
+            unit: one of units.OUTPUT_OF_1_G, which the first pose is held against; None for any other.
+        """
+        self.planned, self.hold, self.still = planned, max(hold, window), still
+        self.stated, self.unit = (scale, centre), unit
+        self.taken: list[Held] = []
+        self.window = np.zeros((window, 3))
+        self.seen = 0
+        self.run: list[Float] = []
+        self.done_here = False
+        self.rough: Rough | None = None
+
+    def push(self, reading: Float) -> Status | None:
+        """Take in one reading, shape (3,); None while the first window fills.
+
+        Raises:
+            DataError: the first pose cannot be 1 g in the stated unit; it is not taken.
+        """
+        self.window[self.seen % len(self.window)] = reading
+        self.seen += 1
+        if self.seen < len(self.window):
+            return None
+        mean = self.window.mean(axis=0)
+        rough = self.rough or rough_sensor(mean[None], *self.stated)
+        limit = STILL * rough.scale if self.still is None else self.still
+        spread = float((self.window - reading).std(axis=0).max())
+        state = self._step(reading, mean, rough, quiet=spread <= limit, limit=limit)
+        direction = (self.rough or rough).directions(mean)
+        nearest, angle = _nearest(direction, self.planned)
+        return Status(state, spread, limit, min(len(self.run) / self.hold, 1.0), nearest, angle)
+
+    def _step(self, reading: Float, mean: Float, rough: Rough, *, quiet: bool, limit: float) -> State:
+        if not quiet:
+            self.run, self.done_here = [], False
+            return "moving"
+        if self.done_here or self._known(rough.directions(mean)):
+            self.run = []
+            return "again"
+        self.run += [reading] if self.run else list(self.window)
+        if len(self.run) < self.hold:
+            return "still"
+        held = np.array(self.run)
+        if held.std(axis=0).max() > limit:  # it drifts, too slowly for the window to tell
+            self.run = self.run[-len(self.window) :]
+            return "still"
+        away = held - reading  # so that equal readings have no spread, and their own value as mean
+        self._take(Held(len(held), reading + away.mean(axis=0), away.std(axis=0, ddof=1)))
+        return "taken"
+
+    def _take(self, held: Held) -> None:
+        if self.unit is not None and not self.taken:
+            check_unit(held.mean - (0.0 if self.stated[1] is None else self.stated[1]), self.unit)
+        self.taken.append(held)
+        self.run, self.done_here = [], True
+        self.rough = rough_sensor(np.array([pose.mean for pose in self.taken]), *self.stated)
+
+    def _known(self, direction: Float) -> bool:
+        if self.rough is None:
+            return False
+        return _nearest(direction, self.directions())[1] < SAME
+
+    def directions(self) -> Float:
+        """Return the directions of the poses taken, as far as they are known, shape (J, 3)."""
+        if self.rough is None:
+            return np.zeros((0, 3))
+        return self.rough.directions(np.array([pose.mean for pose in self.taken]))
+
+    def recognised(self) -> list[int | None]:
+        """Return the planned pose that each pose taken is, None for one beside the plan.
+
+        Under the latest rough sensor: what an early pose is may become clear with the later ones.
+        """
+        found = [_nearest(direction, self.planned) for direction in self.directions()]
+        return [index if angle < NEAR else None for index, angle in found]
+
+    def missing(self) -> list[int]:
+        """Return the planned poses that have not been taken."""
+        there = set(self.recognised())
+        return [index for index in range(len(self.planned)) if index not in there]
+
+
+def _nearest(direction: Float, among: Float) -> tuple[int, float]:
+    """Return the number of the nearest of some unit directions, shape (P, 3), and the degrees to it."""
+    cosine = among @ direction
+    best = int(np.argmax(cosine))
+    return best, math.degrees(math.acos(min(1.0, max(-1.0, float(cosine[best])))))

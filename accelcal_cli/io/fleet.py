@@ -1,0 +1,375 @@
+"""Static readings of many sensors, handed out in batches whose arrays a computer likes.
+
+Files of many sensors: one table with a column that labels the sensor, or one file a sensor.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.io.columns import Columns, choose, sensor_column, sensor_columns
+from accelcal_cli.io.reader import Table, open_table
+from accelcal_cli.io.readings import LabelledMeans, Readings, check_rows
+from accelcal_cli.io.screening import LOOKED_AT, doubts, log_cautions
+from accelcal_cli.io.stream import RowStore
+from accelcal_cli.io.text import Rows
+
+SLAB = 2_000_000
+"""Poses that are in memory at once, unless one sensor has more."""
+
+BATCH = 16_384
+"""Poses of a batch at most, unless one sensor has more: few enough for the processor's caches."""
+
+STRETCH = 1.25
+"""No sensor of a batch has more than so many times the poses of another."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A table that was read.
+
+    Attributes:
+        name: as given; sha256: of its bytes; columns: names of its output columns.
+        first: number of its first pose among those of all tables.
+        where: how to name one of its poses, counted from 0.
+        notes: what the reader did that a user should know.
+        rows: whether each row is taken for a pose, not each label; timed: whether they have times.
+    """
+
+    name: str
+    sha256: str
+    columns: tuple[str, str, str]
+    first: int
+    where: Callable[[int], str]
+    notes: tuple[str, ...]
+    rows: bool
+    timed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The poses of R sensors as arrays of one length J; a sensor with fewer repeats its last pose.
+
+    Attributes:
+        sensors: their numbers, shape (R,); count: poses of each, shape (R,).
+        output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
+        behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table tells.
+        scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise.
+    """
+
+    sensors: Int
+    count: Int
+    output: Float
+    pose: Int
+    behind: Float | None = None
+    scatter: Float | None = None
+
+    @property
+    def real(self) -> Bool:
+        """Which poses are no repetitions, shape (R, J)."""
+        return np.asarray(np.arange(self.output.shape[1]) < self.count[:, None])
+
+    def take(self, index: Int) -> Batch:
+        """Return the sensors at `index`."""
+        behind = None if self.behind is None else self.behind[index]
+        scatter = None if self.scatter is None else self.scatter[index]
+        return Batch(
+            self.sensors[index], self.count[index], self.output[index], self.pose[index], behind, scatter
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FleetReadings:
+    """Static readings of R sensors.
+
+    Attributes:
+        source: the file, or how many.
+        sensors: their labels, in the order in which they came; poses: J of each, shape (R,).
+        origins: the tables, in their order.
+    """
+
+    source: str
+    sensors: tuple[str, ...]
+    poses: Int
+    origins: tuple[Origin, ...]
+    _store: RowStore = field(repr=False)  # number of the sensor, output
+    _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
+
+    @cached_property
+    def _firsts(self) -> list[int]:
+        return [origin.first for origin in self.origins]
+
+    def origin(self, pose: int) -> Origin:
+        """Return the table that a pose came from, by its number among all."""
+        return self.origins[bisect.bisect_right(self._firsts, pose) - 1]
+
+    def where(self, pose: int) -> str:
+        """Return how to name a pose, by its number among all: ``line 8``."""
+        origin = self.origin(pose)
+        return origin.where(pose - origin.first)
+
+    def one(self, batch: Batch, at: int) -> Readings:
+        """Return the readings of the sensor at `at` in a batch, as `calibrate` takes them."""
+        count, poses = int(batch.count[at]), batch.pose[at]
+        origin, name = self.origin(int(poses[0])), self.sensors[batch.sensors[at]]
+        readings = Readings.from_array(
+            batch.output[at, :count],
+            source=f'{origin.name}, sensor "{name}"',
+            count=_known(batch.behind, at, count),
+            scatter=_known(batch.scatter, at, count),
+        )
+        return readings.known_as(
+            origin.sha256,
+            origin.columns,
+            origin.notes,
+            lambda pose: self.where(int(poses[pose])),
+            self.cautions(batch, at),
+        )
+
+    def cautions(self, batch: Batch, at: int) -> tuple[str, ...]:
+        """Return why the readings of the sensor at `at` in a batch may be no poses, in sentences."""
+        origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
+        first = output[:LOOKED_AT]
+        log: tuple[str, ...] = ()
+        if origin.rows:
+            span = float(np.ptp(output, axis=0).max())
+            log = log_cautions(len(output), first, span, timed=origin.timed)
+        return (*log, *doubts(first, origin.columns))
+
+    def batches(self) -> Iterator[Batch]:
+        """Yield every sensor once, in batches of about equally many poses."""
+        ends = np.cumsum(self.poses)
+        first = 0
+        while first < len(ends):
+            start = int(ends[first] - self.poses[first])
+            last = max(int(np.searchsorted(ends, start + SLAB, side="right")), first + 1)
+            yield from self._slab(first, last)
+            first = last
+
+    def _slab(self, first: int, last: int) -> Iterator[Batch]:
+        """Yield the sensors from `first` to `last` - 1."""
+        rows, pose = self._select(first, last)
+        extras = None if self._extras is None else _gather(self._extras, pose)
+        order = np.argsort(rows[:, 0], kind="stable")
+        counts = self.poses[first:last]
+        starts = np.cumsum(counts) - counts
+        by_count = np.argsort(counts, kind="stable")
+        for group in _groups(counts[by_count]):
+            index = by_count[group]
+            steps = np.minimum(np.arange(int(counts[index].max())), counts[index, None] - 1)
+            at = order[starts[index, None] + steps]
+            yield Batch(
+                first + index,
+                counts[index],
+                rows[at, 1:],
+                pose[at],
+                None if extras is None else extras[at, 0],
+                None if extras is None else extras[at, 1:],
+            )
+
+    def _select(self, first: int, last: int) -> tuple[Float, Int]:
+        """Return the rows of the sensors from `first` to `last` - 1 and the numbers of their poses."""
+        if last - first == len(self.poses):
+            return self._store.all(), np.arange(self._store.rows)
+        rows, numbers = [], []
+        for start, block in self._store.blocks():
+            chosen = np.flatnonzero((block[:, 0] >= first) & (block[:, 0] < last))
+            rows.append(block[chosen])
+            numbers.append(start + chosen)
+        return np.concatenate(rows), np.concatenate(numbers)
+
+
+def _gather(store: RowStore, numbers: Int) -> Float:
+    """Return the rows of these numbers, which ascend."""
+    if len(numbers) == store.rows:
+        return store.all()
+    parts = []
+    for start, block in store.blocks():
+        low, high = np.searchsorted(numbers, (start, start + len(block)))
+        parts.append(block[numbers[low:high] - start])
+    return np.concatenate(parts)
+
+
+def _groups(counts: Int) -> Iterator[slice]:
+    """Yield runs of sensors, sorted by their counts, that make a batch."""
+    first = 0
+    while first < len(counts):
+        longest = int(STRETCH * counts[first])
+        last = int(np.searchsorted(counts, longest, side="right"))
+        last = min(last, first + max(1, BATCH // longest))
+        yield slice(first, last)
+        first = last
+
+
+def _known(extra: Float | None, at: int, count: int) -> Float | None:
+    """Return what is known of one sensor's poses; None where nothing is."""
+    found = None if extra is None else extra[at, :count]
+    return None if found is None or np.isnan(found).all() else found
+
+
+MOST_POSES = 20_000_000
+"""Poses with a label of their own in one table, at most."""
+
+COLD = "Temperature column not used: slopes with temperature go sensor by sensor, with calibrate."
+
+
+def read_fleet(
+    sources: Sequence[str],
+    columns: Sequence[str] | None = None,
+    sensor: str | None = None,
+    *,
+    stdin: BinaryIO | None = None,
+) -> FleetReadings:
+    """Read the static readings of many sensors; ``-`` is standard input.
+
+    One table has a column that labels the sensor, found by its name or named by `sensor`. Of several files each is
+    one sensor, named by its file, unless `sensor` names that column. `columns` are the three output columns.
+
+    Raises:
+        DataError: a fault of the input, with its place; UsageError: of `columns` or `sensor`, or a file twice.
+    """
+    again = next((source for k, source in enumerate(sources) if source in sources[:k]), None)
+    if again is not None:
+        raise UsageError(f"{again}: is given twice")
+    each = len(sources) > 1 and sensor is None
+    names = _file_names(sources) if each else [None] * len(sources)
+    gathered = _Gathering()
+    for source, name in zip(sources, names, strict=True):
+        table = open_table(source, stdin)
+        try:
+            gathered.read(table, columns, sensor, name)
+        finally:
+            table.close()
+    label = gathered.origins[0].name if len(sources) == 1 else f"{len(sources)} files"
+    if not each and gathered.store.rows == len(gathered.index) > 1:
+        raise DataError(
+            f"{label}: every row has another sensor; expected several poses of each (--sensor-column says which "
+            "column labels the sensor)"
+        )
+    return gathered.fleet(label)
+
+
+def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
+    """Return a name for each file: its own without the ending, with as many folders as tell them apart."""
+    paths = [Path(source) for source in sources]
+    names = [path.stem for path in paths]
+    for parts in range(2, max(len(path.parts) for path in paths) + 1):
+        if len(set(names)) == len(names):
+            break
+        names = ["/".join((*path.parts[-parts:-1], path.stem)) for path in paths]
+    return names if len(set(names)) == len(names) else sources
+
+
+class _Gathering:
+    """What the tables so far hold."""
+
+    def __init__(self) -> None:
+        self.index: dict[str, int] = {}
+        self.poses: Int = np.zeros(0, dtype=np.intp)
+        self.store = RowStore(4)
+        self.extras: RowStore | None = None
+        self.origins: list[Origin] = []
+
+    def fleet(self, source: str) -> FleetReadings:
+        return FleetReadings(
+            source, tuple(self.index), self.poses, tuple(self.origins), self.store, self.extras
+        )
+
+    def read(self, table: Table, wanted: Sequence[str] | None, sensor: str | None, name: str | None) -> None:
+        """Read one table: of the sensor `name`, or of many."""
+        first = self.store.rows
+        column = sensor_column(table, sensor) if name is None else _own_column(table)
+        columns = choose(table, wanted, column)
+        if column in columns.output:
+            shown = columns.names[columns.output.index(column)]
+            raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
+        means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
+        for rows in table.blocks(columns.selection()):
+            if not len(rows.numbers):
+                continue
+            check_rows(table, columns, rows)
+            codes = self._codes(rows.texts[0] if name is None else _only(table, columns, rows, name))
+            if means is None:
+                self._add(codes, rows.numbers[:, :3], *_extras(columns, rows))
+            else:
+                keys = list(zip(codes.tolist(), rows.texts[-1], strict=True))
+                means.add(keys, rows.numbers[:, :3], *_extras(columns, rows))
+        where = table.where
+        if means is not None:
+            keys = list(means.index)
+            codes = np.array([code for code, _ in keys], dtype=np.intp)
+            self._add(codes, means.mean, means.count(), means.scatter())
+            where = _by_label([label for _, label in keys])
+        self.origins.append(
+            Origin(
+                table.name,
+                table.sha256,
+                columns.names,
+                first,
+                where,
+                columns.notes if columns.temperature is None else (*columns.notes, COLD),
+                rows=means is None,
+                timed=columns.time is not None,
+            )
+        )
+
+    def _codes(self, labels: Sequence[str]) -> Int:
+        """Return the numbers of sensors, shape (B,), by their labels; a new one gets the next."""
+        index = self.index
+        found = (index.setdefault(label, len(index)) for label in labels)
+        return np.fromiter(found, np.intp, len(labels))
+
+    def _add(self, codes: Int, output: Float, behind: Float | None, scatter: Float | None) -> None:
+        """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""
+        before = self.store.rows
+        self.poses = np.pad(self.poses, (0, len(self.index) - len(self.poses)))
+        self.poses += np.bincount(codes, minlength=len(self.poses))
+        self.store.append(np.column_stack([codes, output]))
+        if behind is None and scatter is None and self.extras is None:
+            return
+        if self.extras is None:
+            self.extras = RowStore(4)
+            self.extras.append(np.full((before, 4), np.nan))
+        rows = np.full((len(codes), 4), np.nan)
+        if behind is not None:
+            rows[:, 0] = behind
+        if scatter is not None:
+            rows[:, 1:] = scatter
+        self.extras.append(rows)
+
+
+def _own_column(table: Table) -> int | None:
+    """Return the column that labels the sensor in a table that should hold one only, if there is one."""
+    found, _ = sensor_columns(table)
+    return found[0] if len(found) == 1 else None
+
+
+def _only(table: Table, columns: Columns, rows: Rows, name: str) -> list[str]:
+    """Return the name of a file's sensor for each row; more than one label in its sensor column is refused."""
+    if columns.sensor is not None and len(set(rows.texts[0])) > 1:
+        shown = (table.names or ())[columns.sensor]
+        raise DataError(
+            f'{table.name}: column "{shown}" labels several sensors where one file a sensor was expected; '
+            f'state --sensor-column "{shown}" to read every file so'
+        )
+    return [name] * len(rows.numbers)
+
+
+def _by_label(labels: list[str]) -> Callable[[int], str]:
+    return lambda pose: f'position "{labels[pose]}"'
+
+
+def _extras(columns: Columns, rows: Rows) -> tuple[Float | None, Float | None]:
+    """Return count (B,) and standard deviation (B, 3) of the rows, where the table has them."""
+    at = 3 if columns.count is None else 4
+    count = None if columns.count is None else rows.numbers[:, 3]
+    return count, None if columns.scatter is None else rows.numbers[:, at : at + 3]

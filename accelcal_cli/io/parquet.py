@@ -1,0 +1,204 @@
+"""Tables in Parquet form.
+
+A Parquet log written anew, as Parquet or as text.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import polars as pl
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.io.reader import Table
+from accelcal_cli.io.rewrite import Change, system_errors
+from accelcal_cli.io.stream import Beside, ByteSource
+from accelcal_cli.io.text import LIMIT, NO_LABEL, Rows, Selection
+
+ROWS = 500_000  # rows of a block
+
+
+class ParquetTable:
+    """A Parquet file, streamed a batch of rows at a time."""
+
+    has_rows: bool
+
+    def __init__(self, source: ByteSource, path: Path | None) -> None:
+        """Look at the schema. Without a `path` (standard input) make a copy: Parquet starts at its end."""
+        self.name = source.name
+        self._source = source
+        self._hashing = Beside()
+        self._files = ExitStack()
+        try:
+            self._path = path or self._copy()
+            with _named_errors(self.name):
+                frame = pl.scan_parquet(self._path)
+                schema = frame.collect_schema()
+                self.has_rows = bool(frame.head(1).collect().height)
+        except BaseException:
+            self._files.close()
+            raise
+        if source.hashed:
+            self._hashing.start(lambda: deque(source.rest(), maxlen=0))
+        self.names: tuple[str, ...] = tuple(schema)
+        self.numeric = tuple(kind.is_numeric() for kind in schema.values())
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the file."""
+        self._hashing.wait()
+        return self._source.sha256
+
+    def blocks(self, selection: Selection) -> Iterator[Rows]:
+        """Read the selected columns."""
+        wanted = [self.names[k] for k in (*selection.numbers, *selection.texts)]
+        for _, rows in self._read(selection, sorted(set(wanted), key=wanted.index)):
+            yield rows
+
+    def pairs(self, selection: Selection) -> Iterator[tuple[pl.DataFrame, Rows]]:
+        """Read blocks of all columns, each with the selected columns of its rows."""
+        return self._read(selection, list(self.names))
+
+    def _read(self, selection: Selection, wanted: list[str]) -> Iterator[tuple[pl.DataFrame, Rows]]:
+        for column in selection.numbers:
+            if not self.numeric[column]:
+                raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
+        start = 0
+        for frame in self._batches(wanted):
+            numbers = np.empty((frame.height, len(selection.numbers)))
+            for k, column in enumerate(selection.numbers):
+                series = frame[self.names[column]].cast(pl.Float64).fill_null(float("nan"))
+                numbers[:, k] = series.to_numpy()
+                self._check(numbers[:, k], start, column, column in selection.gaps)
+            labels = tuple(self._labels(frame, start, column) for column in selection.texts)
+            yield frame, Rows(start, numbers, labels)
+            start += frame.height
+
+    @property
+    def where(self) -> Callable[[int], str]:
+        """Row number, counted from 1."""
+        return _row
+
+    def close(self) -> None:
+        """Remove the copy and close the file."""
+        self._source.stop()
+        self._hashing.wait()
+        self._source.close()
+        self._files.close()
+
+    def _copy(self) -> Path:
+        try:
+            copy = tempfile.NamedTemporaryFile(prefix="accelcal-", suffix=".parquet")  # noqa: SIM115
+            self._files.enter_context(copy)
+            copy.write(self._source.head)
+            for block in self._source.rest():
+                copy.write(block)
+            copy.flush()
+        except OSError as problem:
+            raise DataError(
+                f"{self.name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})"
+            ) from problem
+        return Path(copy.name)
+
+    def _batches(self, wanted: list[str]) -> Iterator[pl.DataFrame]:
+        lazy = pl.scan_parquet(self._path).select(wanted)
+        start = 0
+        while True:
+            with _named_errors(self.name):
+                frame = lazy.slice(start, ROWS).collect()
+            if frame.is_empty():
+                return
+            yield frame
+            start += frame.height
+
+    def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
+        bad = ~(np.abs(numbers) <= LIMIT)
+        if gaps:
+            bad &= ~np.isnan(numbers)
+        if bad.any():
+            row = int(np.argmax(bad))
+            value = numbers[row]
+            what = "is empty or nan" if np.isnan(value) else f"{value:g} is too large or infinite"
+            where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
+            raise DataError(f"{where}: {what}; a finite number was expected")
+
+    def _labels(self, frame: pl.DataFrame, start: int, column: int) -> list[str]:
+        series = frame[self.names[column]]
+        try:
+            labels: list[str | None] = series.cast(pl.String).to_list()
+        except pl.exceptions.PolarsError:  # lists, or bytes that are no UTF-8
+            raise DataError(
+                f'{self.name}, column "{series.name}": holds {series.dtype}; text or numbers were expected as labels'
+            ) from None
+        for row, label in enumerate(labels):
+            if not label:
+                where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
+                raise DataError(f"{where}: {NO_LABEL}")
+        return [label or "" for label in labels]
+
+
+def _row(row: int) -> str:
+    return f"row {row + 1}"
+
+
+@contextmanager
+def _named_errors(name: str) -> Iterator[None]:
+    """Word what polars finds wrong with a file; a panic of its decoder is no subclass of its errors."""
+    try:
+        yield
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as problem:
+        reason = str(problem).strip().splitlines()[0][:200]
+        raise DataError(f"{name}: cannot be read as Parquet ({reason})") from problem
+
+
+def frames(table: ParquetTable, change: Change) -> Iterator[pl.DataFrame]:
+    """Yield the changed log, block after block."""
+    for frame, rows in table.pairs(change.selection):
+        values = np.ascontiguousarray(change.compute(rows.numbers).T)
+        new = [pl.Series(name, column) for name, column in zip(change.names, values, strict=True)]
+        for place, column in zip(change.places, new, strict=False):
+            frame.replace_column(place, column)
+        yield frame.hstack(new[len(change.places) :])
+
+
+def to_text(table: Table, change: Change, file: IO[bytes]) -> None:
+    """Write the changed log as CSV."""
+    assert isinstance(table, ParquetTable)
+    for k, frame in enumerate(frames(table, change)):
+        with system_errors():
+            frame.write_csv(file, include_header=k == 0)
+
+
+def to_parquet(table: Table, change: Change, file: IO[bytes]) -> None:
+    """Write the changed log as Parquet, by the name of the file if it has one.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    from polars.io.plugins import register_io_source
+
+    assert isinstance(table, ParquetTable)
+    fault: list[BaseException] = []
+    blocks = frames(table, change)
+    first = next(blocks)
+
+    def source(*_: Any) -> Iterator[pl.DataFrame]:
+        yield first
+        try:
+            yield from blocks
+        except BaseException as problem:  # polars would wrap it beyond recognition
+            fault.append(problem)
+
+    target = (
+        file.name if isinstance(file.name, str) else file
+    )  # what was open already has no name, but a number
+    with system_errors():
+        register_io_source(source, schema=first.schema).sink_parquet(target)
+    if fault:
+        raise fault[0]

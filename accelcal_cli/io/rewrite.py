@@ -1,0 +1,196 @@
+"""A log written anew with more columns, or with others in place of its readings; every other byte stays as it was."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import IO
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.io.dialect import BOM, Dialect, is_blank
+from accelcal_cli.io.reader import TextTable
+from accelcal_cli.io.stream import Beside
+from accelcal_cli.io.text import Selection, has_outer_blank_line
+
+BATCH = 8192  # rows that polars formats at a time
+SMALL = 1 << 20  # bytes: a block up to this size does not need polars
+
+
+@dataclass(frozen=True)
+class Change:
+    """What to do to every row.
+
+    Attributes:
+        selection: the columns that the new ones are computed from.
+        compute: new columns, shape (B, k), of the selected ones, shape (B, n).
+        names: of the new columns.
+        places: columns that the first new ones replace; empty when all are added at the end.
+    """
+
+    selection: Selection
+    compute: Callable[[Float], Float]
+    names: Sequence[str]
+    places: tuple[int, ...] = ()
+
+
+def rewrite(table: TextTable, change: Change, file: IO[bytes]) -> None:
+    """Write the changed log, block after block, in constant memory: one is written while the next is parsed.
+
+    Raises:
+        DataError: a cell that is wrong, by its line and column.
+        OSError: the file cannot be written.
+    """
+    lines, writing = _Lines(table.dialect, change), Beside()
+    try:
+        for block, rows in table.pairs(change.selection):
+            writing.start(partial(lines.write, block, change.compute(rows.numbers), file))
+    finally:
+        writing.wait()
+
+
+class _Lines:
+    """Writes blocks of whole lines, and keeps count of lines across blocks."""
+
+    def __init__(self, dialect: Dialect, change: Change) -> None:
+        self.dialect, self.change = dialect, change
+        self.line = 0
+        self.glue = dialect.separator.encode()
+        self.titled = dialect.names is None or dialect.header_line > 0
+        self.quoted = dialect.decimal_comma and dialect.separator == ","
+
+    def write(self, block: bytes, values: Float, file: IO[bytes]) -> None:
+        """Write the changed block: by polars where every line is a plain row, else line by line."""
+        end = "\r\n" if b"\r" in block else "\n"
+        if not (self._plain(block, len(values), end.encode()) and self._written(block, values, end, file)):
+            file.write(self._careful(block, values))
+
+    def _plain(self, block: bytes, rows: int, end: bytes) -> bool:
+        """Whether to try polars: past the header, one kind of line ends, no blank line that it would drop."""
+        if len(block) < SMALL or self.quoted or not self.titled or self.line < self.dialect.header_line:
+            return False
+        if not block.endswith(end) or has_outer_blank_line(block):
+            return False
+        if end == b"\r\n" and not block.count(end) == block.count(b"\r") == block.count(b"\n"):
+            return False
+        return not self.change.places or self._regular(block, rows)
+
+    def _regular(self, block: bytes, rows: int) -> bool:
+        """Whether separators alone part the cells, as many on every line, and none is left over at its end."""
+        return (
+            b'"' not in block
+            and self.glue != b" "
+            and block.count(self.glue) == (self.dialect.width - 1) * rows
+        )
+
+    def _written(self, block: bytes, values: Float, end: str, file: IO[bytes]) -> bool:
+        import polars as pl
+
+        separator, width = self.dialect.separator, self.dialect.width
+        # A separator that no text has makes one cell of the line.
+        split, names = (separator, range(width)) if self.change.places else ("\x01", range(1))
+        if split == "\x01" and b"\x01" in block:
+            return False
+        schema = {f"old {k}": pl.String for k in names}
+        try:
+            frame = pl.read_csv(block, has_header=False, schema=schema, quote_char=None, separator=split)
+        except pl.exceptions.PolarsError:
+            return False
+        if len(frame) != len(values):  # comments, or blank lines
+            return False
+        left_over = (
+            separator != " " and not self.change.places and frame["old 0"].str.ends_with(separator).any()
+        )
+        if left_over and not self._regular(block, len(values)):
+            return False
+        new = [pl.Series(f"new {k}", column) for k, column in enumerate(values.T)]
+        for place, column in zip(self.change.places, new, strict=False):
+            frame.replace_column(place, column)
+        file.flush()
+        with system_errors():
+            frame.hstack(new[len(self.change.places) :]).write_csv(
+                file,
+                include_header=False,
+                separator=separator,
+                line_terminator=end,
+                quote_style="never",
+                batch_size=BATCH,
+                decimal_comma=self.dialect.decimal_comma,
+            )
+        self.line += len(values)
+        return True
+
+    def _careful(self, block: bytes, values: Float) -> bytes:
+        """Return the changed block, line by line."""
+        cells = [[self._number(v) for v in row] for row in values.tolist()]
+        out, row = [], 0
+        for raw in io.BytesIO(block):
+            self.line += 1
+            line = raw.rstrip(b"\r\n")
+            text = line.removeprefix(BOM).decode(errors="replace").lstrip()
+            if self.line == self.dialect.header_line:
+                line = self._changed(line, [name.encode() for name in self.change.names])
+            elif text.startswith("#"):
+                line = self._comment(line)
+            elif not is_blank(text):
+                self.titled = True
+                line = self._changed(line, cells[row])
+                row += 1
+            out += [line, raw[len(raw.rstrip(b"\r\n")) :]]
+        return b"".join(out)
+
+    def _number(self, value: float) -> bytes:
+        text = repr(value) if value == value else "NaN"  # as polars writes it
+        text = text.replace(".", ",") if self.dialect.decimal_comma else text
+        return (f'"{text}"' if self.quoted else text).encode()
+
+    def _comment(self, line: bytes) -> bytes:
+        """Return a comment line; one that names the columns names the new ones, too."""
+        body = line.split(b"#", 1)[1]
+        if self.titled or self.dialect.split(body.decode(errors="replace")) != list(self.dialect.names or ()):
+            return line
+        self.titled = True
+        start = len(line) - len(body)
+        return line[:start] + self._changed(body, [name.encode() for name in self.change.names])
+
+    def _changed(self, line: bytes, cells: Sequence[bytes]) -> bytes:
+        """Return a line with the first new cells in their places and the others at its end."""
+        spans = _spans(line, self.glue)
+        if len(spans) == self.dialect.width + 1 and spans[-1][0] == spans[-1][1]:
+            line = line[: spans.pop()[0] - 1]  # a separator at the end of the line
+        places = self.change.places
+        for place, cell in sorted(zip(places, cells, strict=False), reverse=True):
+            start, stop = spans[place]
+            line = line[:start] + cell + line[stop:]
+        return self.glue.join([line, *cells[len(places) :]])
+
+
+def _spans(line: bytes, glue: bytes) -> list[tuple[int, int]]:
+    """Return where the cells of a line start and stop; a separator within quotes parts none."""
+    if glue == b" ":
+        return [found.span() for found in re.finditer(rb'"[^"]*"|\S+', line)]
+    cuts = [at.start() for at in re.finditer(re.escape(glue), line)]
+    if b'"' in line:
+        cuts = [at for at in cuts if line.count(b'"', 0, at) % 2 == 0]
+    return list(zip([0, *(at + 1 for at in cuts)], [*cuts, len(line)], strict=True))
+
+
+@contextmanager
+def system_errors() -> Iterator[None]:
+    """Give the faults of the system that polars wraps their own class again: a full disk, a reader that left."""
+    import polars as pl
+
+    try:
+        yield
+    except (pl.exceptions.PolarsError, OSError) as problem:
+        if isinstance(problem, OSError) and problem.errno:
+            raise
+        reason = str(problem).strip().splitlines()[0]
+        number = re.search(r"os error (\d+)", reason)
+        code = int(number[1]) if number else errno.EIO
+        raise OSError(code, os.strerror(code) if number else reason) from problem

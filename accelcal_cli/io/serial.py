@@ -1,0 +1,126 @@
+"""Lines of text as they arrive: from a serial port, or from a file that is open."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from serial import Serial
+
+
+LONGEST = 4096
+"""Bytes of a line at most: more without a line end is no text."""
+
+PATIENCE = 100
+"""Lines in a row without the numbers wanted, after which the stream is the wrong one."""
+
+SHOWN = 60
+
+_BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"']+")
+
+
+def file_lines(file: BinaryIO) -> Iterator[bytes]:
+    """Yield the lines of an open file as they come."""
+    yield from iter(lambda: file.readline(LONGEST), b"")
+
+
+def port_lines(name: str, baud: int, timeout: float) -> Iterator[bytes]:
+    """Open a serial port and return the lines that it sends, from the first whole one on.
+
+    Args:
+        name: of the port: /dev/ttyUSB0, COM3.
+        baud: its speed, bits per second; timeout: longest silence, s.
+
+    Raises:
+        UsageError: pyserial is missing.
+        DataError: the port cannot be opened, falls silent, or goes.
+    """
+    return _lines(_open(name, baud, timeout), name, timeout)
+
+
+def _lines(port: Serial, name: str, timeout: float) -> Iterator[bytes]:
+    with port:
+        rest, started = b"", False
+        while True:
+            rest += _received(port, name, timeout)
+            *lines, rest = rest.replace(b"\r", b"\n").split(b"\n")
+            if len(rest) > LONGEST:
+                raise DataError(
+                    f"{name}: {LONGEST} bytes without a line end; is --baud {port.baudrate} right?"
+                )
+            yield from lines if started else lines[1:]
+            started = started or bool(lines)
+
+
+def _open(name: str, baud: int, timeout: float) -> Serial:
+    try:
+        import serial
+    except ImportError:
+        raise UsageError("a serial port needs pyserial: pip install 'accelcal[serial]'") from None
+    try:
+        return serial.Serial(name, baud, timeout=timeout)
+    except (OSError, ValueError) as error:  # a SerialException is an OSError
+        reason = str(error).rpartition("]")[2].strip() or str(error)
+        raise DataError(f"{name}: cannot be opened: {reason.lower()}") from None
+
+
+def _received(port: Serial, name: str, timeout: float) -> bytes:
+    try:
+        chunk: bytes = port.read(max(1, port.in_waiting))
+    except OSError:
+        raise DataError(f"{name}: the port is gone") from None
+    if not chunk:
+        raise DataError(f"{name}: no data for {timeout:g} s")
+    return chunk
+
+
+def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Iterator[Float]:
+    """Yield three numbers of each line, shape (3,); lines without them, such as headers, are passed over.
+
+    Raises:
+        DataError: line after line without the numbers.
+    """
+    unread = 0
+    for line in lines:
+        text = line.decode("utf-8", errors="replace").strip()
+        if not text or text.startswith("#"):
+            continue
+        reading = pick(text, columns)
+        if reading is not None:
+            unread = 0
+            yield reading
+            continue
+        unread += 1
+        if unread == PATIENCE:
+            raise DataError(
+                f"{source}: {PATIENCE} lines in a row without {max(columns) + 1} numbers, as "
+                f'"{text[:SHOWN]}"; are --columns and --baud right?'
+            )
+
+
+def pick(line: str, columns: Sequence[int]) -> Float | None:
+    """Return three numbers of a line, counted from 0, shape (3,); None when one is missing or not finite."""
+    found = numbers(line)
+    if len(found) <= max(columns):
+        return None
+    chosen = [found[column] for column in columns]
+    return np.array(chosen) if all(map(math.isfinite, chosen)) else None
+
+
+def numbers(line: str) -> list[float]:
+    """Return the numbers of a line in their order, whatever stands between them; words are passed over."""
+    found = []
+    for word in _BETWEEN.split(line):
+        try:
+            found.append(float(word))
+        except ValueError:
+            continue
+    return found

@@ -1,0 +1,301 @@
+"""Input bytes: opened, hashed and cut into blocks of whole lines.
+
+A store of rows that moves to a temporary file when it outgrows memory.
+
+One call at a time in a thread beside the caller, for work that releases the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from typing import BinaryIO
+
+import numpy as np
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.errors import DataError, did_you_mean
+
+HEAD = 4 << 20  # bytes: an input up to this size is one block and never needs polars
+BLOCK = 16 << 20  # bytes of a later block
+LONGEST_LINE = 1 << 20  # bytes
+
+_FOREIGN = {  # first bytes of what people hand over instead of text
+    b"\x1f\x8b": "gzip-compressed; unpack it first",
+    b"PK\x03\x04": "a zip archive or an Excel workbook; export the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook; export the sheet as CSV",
+    b"\x89HDF": "an HDF5 file; export the readings as CSV or Parquet",
+    b"\xff\xfe": "UTF-16 text; save it as UTF-8",
+    b"\xfe\xff": "UTF-16 text; save it as UTF-8",
+}
+
+
+class ByteSource:
+    """One pass over a file or standard input; `sha256` covers the bytes read so far.
+
+    Hashing runs in a thread beside the parser: hashlib releases the interpreter lock, and at 10 million
+    rows the hash would otherwise cost as much as the parsing.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        name: str,
+        *,
+        head: int = HEAD,
+        block: int = BLOCK,
+        owned: bool = False,
+        hashed: bool = True,
+    ) -> None:
+        """Read the first `head` bytes of `stream`; `block` is the size in bytes of every later read.
+
+        An `owned` stream is closed with the source; one that is not `hashed` has no `sha256`.
+        """
+        self.name = name
+        self._stream = stream
+        self._block = block
+        self._owned = owned
+        self.hashed = hashed
+        self._stopped = False
+        self._hash = hashlib.sha256()
+        self._hashing, self._reading = Beside(), Beside()
+        self._may_read_ahead = stream.seekable()  # a pipe may block, and with it the end of the program
+        self._ahead: bytes | None = None
+        raw = self._read(head)
+        self.whole = len(raw) < head  # the head is all there is
+        self._hash.update(raw)
+        self._carriage_returns = b"\n" not in raw and b"\r" in raw[:-1]  # line ends of old Macs
+        self.head = self._unify(raw)
+        for magic, what in _FOREIGN.items():
+            if raw.startswith(magic):
+                raise DataError(f"{name}: is {what}")
+
+    def stop(self) -> None:
+        """Let `rest` end early, for a reader in another thread."""
+        self._stopped = True
+
+    def close(self) -> None:
+        """Close the stream if it is ours."""
+        self._reading.wait()
+        if self._owned:
+            self._stream.close()
+
+    @property
+    def sha256(self) -> str:
+        """Hexadecimal SHA-256 of the bytes read so far."""
+        self._hashing.wait()
+        return self._hash.hexdigest()
+
+    def blocks(self) -> Iterator[bytes]:
+        """Blocks of whole lines, the head first.
+
+        Only the last block may lack its line end, and one with a line longer than `LONGEST_LINE`: that line
+        comes cut, for the parser to refuse by its number.
+        """
+        rest, fresh = b"", self.head
+        while fresh and not self.whole:
+            cut = fresh.rfind(b"\n") + 1
+            if cut:
+                yield b"".join((rest, memoryview(fresh)[:cut]))
+                rest = b""
+            rest += fresh[cut:]
+            if len(rest) > LONGEST_LINE:
+                break
+            fresh = self._next()
+        if rest or self.whole:
+            yield rest or self.head
+
+    def rest(self) -> Iterator[bytes]:
+        """Every byte after the head, uncut (for binary formats)."""
+        while not (self.whole or self._stopped) and (fresh := self._next()):
+            yield fresh
+
+    def _next(self) -> bytes:
+        """Take the block read ahead, have the next one read, and hash this one, beside the parser."""
+        self._reading.wait()
+        raw = self._ahead if self._ahead is not None else self._read(self._block)
+        if raw and self._may_read_ahead:
+            self._reading.start(self._read_ahead)
+        if raw and self.hashed:
+            self._hashing.start(lambda: self._hash.update(raw))
+        return self._unify(raw)
+
+    def _read_ahead(self) -> None:
+        self._ahead = self._read(self._block)
+
+    def _unify(self, raw: bytes) -> bytes:
+        return raw.replace(b"\r", b"\n") if self._carriage_returns else raw
+
+    def _read(self, size: int) -> bytes:
+        """Read `size` bytes, fewer only at the end: an unbuffered pipe gives what it has."""
+        try:
+            data = self._stream.read(size)
+            while data and len(data) < size and (more := self._stream.read(size - len(data))):
+                data += more
+        except OSError as problem:
+            raise DataError(f"{self.name}: cannot be read ({problem.strerror or problem})") from problem
+        return data
+
+
+def open_source(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> ByteSource:
+    """Open a path, or standard input for ``-``."""
+    if str(source) == "-":
+        return ByteSource(stdin or sys.stdin.buffer, "<stdin>", hashed=hashed)
+    path = Path(source)
+    try:
+        stream = path.open("rb")
+    except FileNotFoundError as problem:
+        raise DataError(f"{source}: no such file{_neighbour(path)}") from problem
+    except IsADirectoryError as problem:
+        raise DataError(f"{source}: is a directory; a file of readings was expected") from problem
+    except PermissionError as problem:
+        raise DataError(f"{source}: no permission to read it") from problem
+    except (OSError, ValueError) as problem:  # ValueError: a NUL in the name
+        raise DataError(f"{source}: cannot be opened ({problem})") from problem
+    try:
+        return ByteSource(stream, str(source), owned=True, hashed=hashed)
+    except BaseException:
+        stream.close()
+        raise
+
+
+def _neighbour(path: Path) -> str:
+    """Name the file in the same folder that was probably meant."""
+    try:
+        names = [entry.name for entry in path.parent.iterdir() if entry.is_file()]
+    except OSError:
+        return f'; the folder "{path.parent}" does not exist either'
+    return did_you_mean(path.name, names)
+
+
+IN_MEMORY = 1_000_000  # rows
+
+
+class RowStore:
+    """Rows of `width` numbers, appended once and read back in blocks as often as needed.
+
+    Beyond `limit` rows they live as float64 in an unlinked temporary file, so that memory stays constant;
+    it is read with ordinary reads, because mapped pages would count as the process's own.
+    """
+
+    def __init__(self, width: int = 3, limit: int = IN_MEMORY) -> None:
+        """Keep up to `limit` rows in memory."""
+        self.rows = 0
+        self.width = width
+        self._limit = limit
+        self._parts: list[Float] = []
+        self._file: BinaryIO | None = None
+        self._writing = Beside()
+
+    def append(self, rows: Float) -> None:
+        """Add rows (B, width)."""
+        if not len(rows):
+            return
+        self._parts.append(np.array(rows, dtype=np.float64, order="C"))
+        self.rows += len(rows)
+        if self.rows > self._limit:
+            parts, self._parts = self._parts, []
+            with _named_disk_errors():
+                self._writing.start(lambda: self._spill(parts))
+
+    def blocks(self, rows: int = 65536) -> Iterator[tuple[int, Float]]:
+        """Yield (first row, block) with blocks of up to `rows` rows; blocks are read-only or private."""
+        self._settle()
+        if self._file is None:
+            whole = self._in_memory()
+            for start in range(0, self.rows, rows):
+                yield start, whole[start : start + rows]
+            return
+        for start in range(0, self.rows, rows):
+            self._settle()  # a writer that came between two blocks moves the file's position
+            block = np.empty((min(rows, self.rows - start), self.width))
+            with _named_disk_errors():
+                self._file.seek(start * self.width * 8)
+                self._fill(block)
+            yield start, block
+
+    def all(self) -> Float:
+        """Every row, (rows, width)."""
+        self._settle()
+        if self._file is None:
+            return self._in_memory()
+        return np.concatenate([block for _, block in self.blocks()])
+
+    def _in_memory(self) -> Float:
+        if len(self._parts) != 1:
+            self._parts = [np.concatenate([np.empty((0, self.width)), *self._parts])]
+        self._parts[0].flags.writeable = False
+        return self._parts[0]
+
+    def _settle(self) -> None:
+        with _named_disk_errors():
+            self._writing.wait()
+
+    def _spill(self, parts: list[Float]) -> None:
+        if self._file is None:
+            import tempfile  # costs as much as reading a small table
+
+            self._file = tempfile.TemporaryFile(prefix="accelcal-", buffering=0)  # noqa: SIM115
+            weakref.finalize(self, self._file.close)
+        self._file.seek(0, os.SEEK_END)
+        for part in parts:
+            view = part.data.cast("B")
+            while view:  # an unbuffered write may take less than all
+                view = view[self._file.write(view) :]
+
+    def _fill(self, block: Float) -> None:
+        view = block.data.cast("B")
+        while view:
+            got = self._file.readinto(view) if self._file is not None else 0  # type: ignore[attr-defined]
+            if not got:
+                raise OSError("the temporary file is shorter than it was written")
+            view = view[got:]
+
+
+@contextmanager
+def _named_disk_errors() -> Iterator[None]:
+    try:
+        yield
+    except OSError as problem:
+        from tempfile import gettempdir
+
+        raise DataError(
+            f"{gettempdir()}: the temporary file for more than {IN_MEMORY:,} readings failed "
+            f"({problem.strerror or problem}); free some space, or set TMPDIR to a larger folder"
+        ) from problem
+
+
+class Beside:
+    """Runs calls in order, each beside what the caller does next."""
+
+    def __init__(self) -> None:
+        """Start with nothing under way."""
+        self._thread: Thread | None = None
+        self._fault: BaseException | None = None
+
+    def start(self, call: Callable[[], object]) -> None:
+        """Wait for the call under way, then start the next."""
+        self.wait()
+        self._thread = Thread(target=self._run, args=(call,), daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Wait for the call under way; raise what it raised."""
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._fault is not None:
+            fault, self._fault = self._fault, None
+            raise fault
+
+    def _run(self, call: Callable[[], object]) -> None:
+        try:
+            call()
+        except BaseException as fault:
+            self._fault = fault

@@ -1,0 +1,310 @@
+"""The careful parser of table rows: it defines what a table means and names the cell that is wrong.
+
+The fast parser of table rows: polars on whole blocks, wherever that is sure to mean the same.
+"""
+
+from __future__ import annotations
+
+import bisect
+import io
+import math
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.errors import DataError
+from accelcal_cli.io.dialect import BOM, Dialect, decode_line, is_blank
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+LIMIT = 1e100  # larger values cannot be squared safely
+SHOWN = 40  # characters of a bad cell that are shown
+NO_LABEL = "is empty; every row needs its label"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Columns to read, counted from 0."""
+
+    numbers: tuple[int, ...]
+    gaps: frozenset[int] = frozenset()  # columns whose cells may be empty or nan
+    texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A block of rows: `numbers` (B, k) and `texts`, each of length B, in the order of the selection."""
+
+    start: int
+    numbers: Float
+    texts: tuple[Sequence[str], ...] = ()
+
+
+@dataclass
+class LineMap:
+    """Line number of every row, kept as the places where lines and rows part (blank lines, comments)."""
+
+    rows: array[int] = field(default_factory=lambda: array("q"))
+    lines: array[int] = field(default_factory=lambda: array("q"))
+
+    def add(self, row: int, line: int) -> None:
+        """State that `row` (from 0) stands on `line` (from 1); rows after it follow line by line."""
+        if not self.rows or line - row != self.lines[-1] - self.rows[-1]:
+            self.rows.append(row)
+            self.lines.append(line)
+
+    def line(self, row: int) -> int:
+        """Line number of a row."""
+        k = bisect.bisect_right(self.rows, row) - 1
+        return self.lines[k] + row - self.rows[k]
+
+    def where(self, row: int) -> str:
+        """How to name a row: ``line 8``."""
+        return f"line {self.line(row)}"
+
+
+class CarefulParser:
+    """Parses text blocks row by row, and keeps count of rows and lines across blocks."""
+
+    def __init__(self, source: str, dialect: Dialect, selection: Selection) -> None:
+        """Parse tables of one dialect; `source` is named in messages."""
+        self.source = source
+        self.dialect = dialect
+        self.selection = selection
+        self.lines = LineMap()
+        self.row = 0  # rows so far
+        self.line = 0  # lines so far
+
+    def parse(self, block: bytes) -> Rows:
+        """Rows of a block of whole lines; the first wrong cell raises DataError."""
+        start, values = self.row, array("d")
+        texts: tuple[list[str], ...] = tuple([] for _ in self.selection.texts)
+        for raw in io.BytesIO(block):
+            self.line += 1
+            line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self.line, self.source)
+            if is_blank(line) or line.lstrip().startswith("#") or self.line == self.dialect.header_line:
+                continue
+            cells = self._cells(line)
+            self.lines.add(self.row, self.line)
+            values.extend([self._number(cells[column], column) for column in self.selection.numbers])
+            for text, column in zip(texts, self.selection.texts, strict=True):
+                text.append(self._label(cells[column], column))
+            self.row += 1
+        numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
+        return Rows(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+
+    def skip(self, rows: int) -> int:
+        """Note that `rows` rows were read elsewhere, one a line; return the first one's number."""
+        start = self.row
+        self.lines.add(start, self.line + 1)
+        self.row += rows
+        self.line += rows
+        return start
+
+    def _cells(self, line: str) -> list[str]:
+        if line.count('"') % 2:
+            raise DataError(f"{self._here()}: a quotation mark is not closed on its line")
+        cells = self.dialect.split(line.rstrip("\r\n"))
+        width = self.dialect.width
+        if len(cells) == width + 1 and not cells[-1]:
+            return cells[:-1]  # a separator at the end of the line
+        if len(cells) != width:
+            whose = "the header has" if self.dialect.header_line else "the first row has"
+            plural = "" if len(cells) == 1 else "s"
+            raise DataError(f"{self._here()}: has {len(cells)} cell{plural} where {whose} {width}")
+        return cells
+
+    def _number(self, cell: str, column: int) -> float:
+        value = to_number(cell, self.dialect.decimal_comma)
+        if value is not None and -LIMIT <= value <= LIMIT:
+            return value
+        if column in self.selection.gaps and (not cell or (value is not None and math.isnan(value))):
+            return math.nan
+        where = f"{self._here()}, column {self._column(column)}"
+        raise DataError(f"{where}: {_complaint(cell, value, self.dialect.decimal_comma)}")
+
+    def _label(self, cell: str, column: int) -> str:
+        if cell:
+            return cell
+        raise DataError(f"{self._here()}, column {self._column(column)}: {NO_LABEL}")
+
+    def _here(self) -> str:
+        return f"{self.source}, line {self.line}"
+
+    def _column(self, column: int) -> str:
+        names = self.dialect.names
+        return f'"{names[column]}"' if names is not None and names[column] else str(column + 1)
+
+
+def to_number(cell: str, decimal_comma: bool) -> float | None:
+    """Value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
+    if decimal_comma:
+        if "." in cell:
+            return None  # 1.234,5 and 1.234 would be thousands here
+        cell = cell.replace(",", ".", 1)
+    if "_" in cell or not cell.isascii():
+        return None
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def shorten(text: str) -> str:
+    """Text in quotes, cut where it is long."""
+    return f'"{text}"' if len(text) <= SHOWN else f'"{text[:SHOWN]}..."'
+
+
+def _complaint(cell: str, value: float | None, decimal_comma: bool) -> str:
+    if not cell:
+        return "is empty; a number was expected"
+    shown = shorten(cell)
+    if value is None:
+        if decimal_comma and "." in cell:
+            return f"{shown} is not a number here: this file writes fractions with a comma"
+        if "," in cell and not decimal_comma:
+            return f"{shown} is not a number here: this file writes fractions with a point"
+        return f"{shown} is not a number"
+    if math.isfinite(value):
+        return f"{shown} is too large for a reading (limit {LIMIT:g})"
+    return f"{shown} is not a finite number"
+
+
+class FastParser:
+    """Parses what polars reads beyond doubt, and hands every other block to the careful parser.
+
+    Beyond doubt: no quotes, comments or blank lines, every row as wide as the first, every number finite.
+    So the careful parser alone says what a table means, and words every error.
+    """
+
+    def __init__(self, careful: CarefulParser) -> None:
+        """Share rows, lines and selection with `careful`."""
+        self.careful = careful
+
+    def parse(self, block: bytes) -> Rows:
+        """Rows of a block of whole lines."""
+        for form in (self._bare, self._plain):
+            plain = form(block)
+            frame = None if plain is None else self._frame(plain)
+            numbers = None if frame is None else self._numbers(frame)
+            texts = None if frame is None else self._texts(frame)
+            if numbers is not None and texts is not None:
+                return Rows(self.careful.skip(len(numbers)), numbers, texts)
+        return self.careful.parse(block)
+
+    def _bare(self, block: bytes) -> bytes | None:
+        """The block as it is, where every column is read as a number, so that nothing odd can hide."""
+        dialect, selection = self.careful.dialect, self.careful.selection
+        if len(set(selection.numbers)) < dialect.width or selection.texts:
+            return None
+        doubtful = dialect.decimal_comma or not block.endswith(b"\n") or has_outer_blank_line(block)
+        return None if doubtful else block
+
+    def _plain(self, block: bytes) -> bytes | None:
+        """The block with one-byte separators only, or None if it needs care."""
+        dialect = self.careful.dialect
+        if b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+            return None
+        if not set(self.careful.selection.texts).isdisjoint(self.careful.selection.numbers):
+            return None
+        if dialect.decimal_comma and (b"." in block or dialect.separator == ","):
+            return None
+        if not block.isascii() and not _is_utf8(block):
+            return None
+        if b"\r" in block:
+            block = block.replace(b"\r\n", b"\n")
+        squeezed = _squeeze(block, dialect.separator)
+        if b'"' in block and (dialect.separator == " " or squeezed != block):
+            return None  # blanks within quotes belong to the cell
+        return None if b"\r" in squeezed or has_outer_blank_line(squeezed) else squeezed
+
+    def _frame(self, block: bytes) -> pl.DataFrame | None:
+        import polars as pl
+
+        dialect, selection = self.careful.dialect, self.careful.selection
+        quoted = b'"' in block
+        schema = {str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)}
+        try:
+            frame = pl.read_csv(
+                block,
+                has_header=False,
+                schema=schema,
+                separator=dialect.separator,
+                quote_char='"' if quoted else None,
+                decimal_comma=dialect.decimal_comma,
+            )
+        except pl.exceptions.PolarsError:
+            return None
+        if quoted and _count(block, "\n") != len(frame):
+            return None  # a cell goes on over the end of its line
+        if frame[str(dialect.width - 1)].null_count():  # an empty last cell, or a row that is short
+            short = quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
+            return None if short else frame
+        return frame
+
+    def _numbers(self, frame: pl.DataFrame) -> NDArray[np.float64] | None:
+        columns = self.careful.selection.numbers
+        numbers = np.empty((len(columns), len(frame))).T  # one column after the other: faster to reduce
+        for k, column in enumerate(columns):
+            series = frame[str(column)]
+            if series.null_count():
+                return None
+            numbers[:, k] = series.to_numpy()
+        sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
+        return numbers if sound else None
+
+    def _texts(self, frame: pl.DataFrame) -> tuple[list[str], ...] | None:
+        """Stripped text of the text columns, None where a cell is empty."""
+        found = []
+        for column in self.careful.selection.texts:
+            text = [(cell or "").strip() for cell in frame[str(column)].to_list()]
+            if not all(text):
+                return None
+            found.append(text)
+        return tuple(found)
+
+
+def has_outer_blank_line(block: bytes) -> bool:
+    """Whether a block begins or ends with a blank line; polars passes over these without a null."""
+    return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
+
+
+def _count(block: bytes, character: str) -> int:
+    return int(np.count_nonzero(np.frombuffer(block, np.uint8) == ord(character)))
+
+
+def _is_utf8(block: bytes) -> bool:
+    try:
+        block.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _squeeze(block: bytes, separator: str) -> bytes:
+    """Drop the blanks around cells; of a run of blanks that is itself the separator leave one."""
+    if separator == " ":
+        block = block.replace(b"\t", b" ")
+    elif b" " not in block and (separator == "\t" or b"\t" not in block):
+        return block
+    text = np.frombuffer(block, np.uint8)
+    while True:
+        blank = text == ord(" ")
+        edge = text == ord("\n")
+        if separator != " ":
+            edge |= text == ord(separator)
+        if separator not in " \t":
+            blank |= text == ord("\t")
+        drop = blank.copy()
+        drop[1:] &= edge[:-1] | blank[:-1] if separator == " " else edge[:-1]
+        drop[:-1] |= blank[:-1] & edge[1:]
+        if not drop.any():
+            return text.tobytes()
+        text = text[~drop]

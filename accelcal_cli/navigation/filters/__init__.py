@@ -1,0 +1,1 @@
+"""The navigation filters, one a file, found by name."""

@@ -1,0 +1,39 @@
+"""PSO-PF: a Gaussian particle swarm moves the predicted particles [fang2007], rebuilt from [depf2015] section 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.navigation.particle_filter import FILTERS, Evolving, Fitness
+from accelcal_cli.rng import Streams
+
+
+@FILTERS.register("pso-pf")
+@dataclass(frozen=True)
+class PsoPf(Evolving):
+    """Particle filter with a Gaussian particle swarm, without inertia or velocity limit [fang2007]."""
+
+    def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
+        """Return the particles after `generations` of v = |n1| (pbest - x) + |n2| (gbest - x)."""
+        place, own, own_fitness = x[:, :movers], x[:, :movers].copy(), fitness[:, :movers]
+        best, best_fitness = _best(x, fitness)
+        for _ in range(self.generations):
+            pull = np.abs(streams.normal(movers, 4))
+            place = place + pull[..., :2] * (own - place) + pull[..., 2:] * (best - place)
+            new = rate(place)
+            better = new > own_fitness
+            own = np.where(better[:, :, None], place, own)
+            own_fitness = np.where(better, new, own_fitness)
+            challenger, value = _best(own, own_fitness)
+            best = np.where((value > best_fitness)[:, :, None], challenger, best)
+            best_fitness = np.maximum(value, best_fitness)
+        return np.concatenate([place, x[:, movers:]], axis=1)
+
+
+def _best(x: Float, fitness: Float) -> tuple[Float, Float]:
+    """Return the best particle, shape (R, 1, 2), and its fitness, shape (R, 1)."""
+    index = fitness.argmax(axis=1)[:, None]
+    return np.take_along_axis(x, index[:, :, None], axis=1), np.take_along_axis(fitness, index, axis=1)

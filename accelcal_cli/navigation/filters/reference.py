@@ -1,0 +1,196 @@
+"""The reference: a Gaussian sum of extended Kalman filters [alspach1972], which tells what is attainable.
+
+The initial square is covered by components, each a Kalman filter of all twelve errors, linearised at its own mean.
+Their weights follow from their innovations; the hopeless are dropped, and those that have come together are one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
+from accelcal_cli.navigation.particle_filter import FILTERS, Filter, Track
+from accelcal_cli.navigation.scenario import Scenario
+from accelcal_cli.rng import Streams
+from accelcal_cli.schema import check, setting
+
+CHUNK = 60
+HOPELESS = 1e-6
+"""Weight below which a component is dropped."""
+
+TOGETHER = 0.01
+"""Squared Mahalanobis distance of the positions below which a lighter component is merged into the heaviest."""
+
+
+MEMORY, UNFIT = 30.0, 4.0
+"""A component whose normalised innovation squared, 1 when all is well, is above UNFIT over MEMORY measurements is
+wrong: its covariance grows."""
+
+
+@dataclass(frozen=True)
+class Bank:
+    """All components of all runs, M in all.
+
+    Attributes:
+        run: whose they are, shape (M,), ascending.
+        mean: metric states, shape (M, 12); P: covariances, shape (M, 12, 12).
+        log_weight: shape (M,).
+        misfit: running mean of the normalised innovation squared, shape (M,).
+    """
+
+    run: Int
+    mean: Float
+    P: Float
+    log_weight: Float
+    misfit: Float
+
+    def at(self, chosen: Int | Bool) -> Bank:
+        """Return some of the components."""
+        return Bank(
+            self.run[chosen], self.mean[chosen], self.P[chosen], self.log_weight[chosen], self.misfit[chosen]
+        )
+
+
+@FILTERS.register("reference")
+@dataclass(frozen=True)
+class Reference(Filter):
+    """Gaussian sum of extended Kalman filters [alspach1972]; it draws no random number."""
+
+    mode: Literal["default", "literal"] = setting("default", "the same filter in either mode")
+    components: int = setting(5, "on either axis of the initial square", low=1, high=50)
+    swell: float = setting(
+        4.0,
+        "growth of a component's covariance when its innovations do not fit; 1: none",
+        low=1.0,
+        high=100.0,
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
+
+    def run(self, scenario: Scenario, streams: Streams) -> Track:  # noqa: ARG002
+        """Return the filter's track; see `Filter`."""
+        track = Track.empty(scenario)
+        bank = self._start(scenario)
+        Q = np.diag(process_noise(scenario.grade, scenario.period))
+        used, F = 0, scenario.transitions(0, 0)
+        for k in range(scenario.epochs):
+            used += len(bank.run)
+            bank, known = _updated(scenario, bank, k)
+            track.blind[:] += np.bincount(bank.run, known, scenario.runs) == 0
+            track.mean[:, k], track.covariance[:, k] = _moments(bank, scenario.runs)
+            bank = _widened(_pruned(bank, scenario.runs), scenario.initial, self.swell)
+            if k % CHUNK == 0:
+                F = scenario.transitions(k, min(k + CHUNK, scenario.epochs))
+                bank = _merged(bank)
+            step = F[bank.run, k % CHUNK]
+            mean = (step @ bank.mean[:, :, None])[:, :, 0]
+            bank = replace(bank, mean=mean, P=step @ bank.P @ step.swapaxes(1, 2) + Q)
+        return replace(track, lookups=used / (scenario.runs * scenario.epochs))
+
+    def _start(self, scenario: Scenario) -> Bank:
+        """Return equal components in the middles of the squares that tile the initial one."""
+        count = self.components
+        width = 2.0 * scenario.initial / count
+        middle = (np.arange(count) + 0.5) * width - scenario.initial
+        mean = np.zeros((count * count, STATES))
+        mean[:, 0], mean[:, 1] = np.repeat(middle, count), np.tile(middle, count)
+        variance = scenario.prior()
+        variance[:2] = width**2 / 12.0
+        runs = scenario.runs
+        return Bank(
+            np.repeat(np.arange(runs), count * count),
+            np.tile(mean, (runs, 1)),
+            np.tile(np.diag(variance), (runs * count * count, 1, 1)),
+            np.zeros(runs * count * count),
+            np.ones(runs * count * count),
+        )
+
+
+def _updated(scenario: Scenario, bank: Bank, k: int) -> tuple[Bank, Bool]:
+    """Return the bank after the measurement of epoch k, and which components are on the map."""
+    latitude = scenario.ins.latitude[bank.run, k]
+    meridian, parallel = metres_per_radian(latitude)
+    place = (
+        latitude - bank.mean[:, 0] / meridian,
+        scenario.ins.longitude[bank.run, k] - bank.mean[:, 1] / parallel,
+    )
+    north, east = scenario.gravity_map.slope(*place)
+    slope = np.stack([-north / meridian, -east / parallel], axis=1)
+    misfit = scenario.measured[bank.run, k] - scenario.gravity_map.at(*place)
+    known: Bool = ~(np.isnan(slope[:, 0]) | np.isnan(slope[:, 1]))
+    slope[~known | np.isnan(misfit)] = 0.0
+    misfit = np.nan_to_num(misfit)
+    gain = (bank.P[:, :, :2] @ slope[:, :, None])[:, :, 0]
+    variance = (gain[:, :2] * slope).sum(axis=1) + scenario.noise**2
+    used = slope.any(axis=1)
+    log_weight = bank.log_weight - np.where(used, 0.5 * misfit**2 / variance + 0.5 * np.log(variance), 0.0)
+    mean = bank.mean + gain * (misfit / variance)[:, None]
+    P = bank.P - gain[:, :, None] * gain[:, None, :] / variance[:, None, None]
+    running = np.where(used, bank.misfit + (misfit**2 / variance - bank.misfit) / MEMORY, bank.misfit)
+    return Bank(bank.run, mean, 0.5 * (P + P.swapaxes(1, 2)), log_weight, running), known
+
+
+def _weights(bank: Bank, runs: int) -> Float:
+    """Return weights that sum to 1 in each run, shape (M,)."""
+    highest = np.full(runs, -np.inf)
+    np.maximum.at(highest, bank.run, bank.log_weight)
+    weight = np.exp(bank.log_weight - highest[bank.run])
+    normal: Float = weight / np.bincount(bank.run, weight, runs)[bank.run]
+    return normal
+
+
+def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
+    """Return mean (R, 2) and covariance (R, 2, 2) of the position error."""
+    weight = _weights(bank, runs)
+    mean: Float = np.stack(
+        [np.bincount(bank.run, weight * bank.mean[:, axis], runs) for axis in (0, 1)], axis=1
+    )
+    away = bank.mean[:, :2] - mean[bank.run]
+    spread = bank.P[:, :2, :2] + away[:, :, None] * away[:, None, :]
+    parts = [np.bincount(bank.run, weight * spread[:, i, j], runs) for i in (0, 1) for j in (0, 1)]
+    return mean, np.stack(parts, axis=1).reshape(runs, 2, 2).astype(float)
+
+
+def _pruned(bank: Bank, runs: int) -> Bank:
+    """Return the bank without hopeless components."""
+    weight = _weights(bank, runs)
+    keep = ~(weight <= HOPELESS)  # a diverged run has weights that are no numbers, and stays so
+    return bank if keep.all() else bank.at(keep)
+
+
+def _widened(bank: Bank, initial: float, swell: float) -> Bank:
+    """Return the bank in which components whose innovations do not fit are wider, to the initial error at most."""
+    wrong = (bank.misfit > UNFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
+    if not wrong.any():
+        return bank
+    P = np.where(wrong[:, None, None], swell * bank.P, bank.P)
+    return replace(bank, P=P, misfit=np.where(wrong, 1.0, bank.misfit))
+
+
+def _merged(bank: Bank) -> Bank:
+    """Return the bank in which each run's heaviest component has taken in those at its place."""
+    keep = np.ones(len(bank.run), dtype=bool)
+    log_weight = bank.log_weight.copy()
+    for first, last in _spans(bank.run):
+        own = slice(first, last)
+        top = first + int(log_weight[own].argmax())
+        away = bank.mean[own, :2] - bank.mean[top, :2]
+        inverse = np.linalg.inv(bank.P[top, :2, :2])
+        near = ((away @ inverse) * away).sum(axis=1) < TOGETHER
+        log_weight[top] = np.logaddexp.reduce(log_weight[own][near])
+        keep[own] = ~near
+        keep[top] = True
+    return replace(bank, log_weight=log_weight).at(keep)
+
+
+def _spans(run: Int) -> list[tuple[int, int]]:
+    """Return first and one past the last component of each run."""
+    edges = [0, *(np.flatnonzero(np.diff(run)) + 1).tolist(), len(run)]
+    return list(pairwise(edges))

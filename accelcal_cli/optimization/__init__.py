@@ -1,0 +1,1 @@
+"""Optimization: problems, optimizers and the one loop that runs them."""

@@ -1,0 +1,107 @@
+"""Differential evolution, as Storn and Price wrote it [storn1997] and as the DPSO paper prints it [dpso2014].
+
+The paper prints equation 3, DE/rand/1, with the individual itself as base vector ("current/1"); Storn and
+Price take a random one. Its crossover keeps the parent's gene where the random number is at most P_c, so that
+P_c is the share of parental genes; Storn and Price's CR is the share of mutant genes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.optimization.operators import (
+    Chance,
+    best_of,
+    better_of,
+    drawn,
+    each,
+    gather,
+    integers,
+    partners,
+    press,
+)
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.problem import Problem
+from accelcal_cli.rng import Streams
+from accelcal_cli.schema import setting
+
+
+def mutates(u: Float, share: float, gene: Int) -> Float:
+    """Return 1 where a trial takes the mutant's gene, 0 where its parent's, shape (R, K, P, D), [dpso2014] eq. 5.
+
+    Args:
+        u: uniform numbers, one a gene, shape (R, K, P, D).
+        share: P_c, the probability to keep the parent's gene.
+        gene: J_rand, the gene always taken from the mutant, shape (R, K, P).
+    """
+    taken = (u > share).astype(float)
+    runs, steps, individuals = (np.arange(size) for size in gene.shape)
+    taken[runs[:, None, None], steps[:, None], individuals, gene] = 1.0
+    return taken
+
+
+@dataclass(frozen=True, eq=False)
+class Generation(State):
+    """A population; x and fx are the individuals and their costs."""
+
+    chances: tuple[Chance, ...] = ()  # partners n, m and base vector, (R, 3, P); 1 where mutated, (R, P, D)
+
+
+@OPTIMIZERS.register("de")
+@dataclass(frozen=True)
+class DifferentialEvolution(Optimizer):
+    """Differential evolution with greedy selection."""
+
+    family = "evolution"
+    paper = "storn1997"
+
+    weight: float = setting(0.3, "weight of the difference vector (F)", above=0, high=2)
+    crossover: float = setting(0.5, "crossover probability (P_c, or CR)", low=0, high=1)
+    strategy: Literal["rand/1", "current/1", "best/1"] = setting(
+        "rand/1", "base vector: rand/1 of Storn and Price, current/1 as the DPSO paper prints, best/1"
+    )
+    crossover_keeps: Literal["parent", "mutant"] = setting(
+        "parent",
+        "what the crossover probability keeps: parent as in the DPSO paper, mutant as in Storn and Price",
+    )
+
+    def init(self, problem: Problem, x: Float, rng: Streams) -> Generation:
+        """Evaluate the starting population."""
+        return Generation(x, problem.cost(x))
+
+    def step(self, problem: Problem, state: Generation, rng: Streams) -> Generation:
+        """Make one generation, all trials from the old population."""
+        x, fx = state.x, state.fx
+        (picks, taken), *ahead = state.chances or self._draw(state, rng)
+        trial = self._change(x, fx, picks)
+        trial *= taken  # [dpso2014] eq. 5
+        trial += x
+        press(trial, *problem.limits)
+        return Generation(*better_of(x, fx, trial, problem.cost(trial)), tuple(ahead))  # [dpso2014] eq. 6
+
+    def _draw(self, state: Generation, rng: Streams) -> tuple[Chance, ...]:
+        """Return partners and crossover of the generations to come."""
+        population, dimensions = state.x.shape[1:]
+        u = drawn(rng, state.fx, population, 4 + dimensions)
+        picks = integers(u[..., :4], population - 1, population - 2, population, dimensions)
+        share = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover
+        taken = mutates(u[..., 4:], share, picks[..., 3, :])
+        partners(picks[..., :2, :])
+        return each(picks[..., :3, :], taken)
+
+    def _change(self, x: Float, fx: Float, picks: Int) -> Float:
+        """Return what mutation adds to x, [dpso2014] eq. 3 and 4: (base - x) + F (x_n - x_m)."""
+        change = gather(x, picks[:, 0])
+        change -= gather(x, picks[:, 1])
+        change *= self.weight
+        if self.strategy == "rand/1":
+            change += gather(x, picks[:, 2])
+            change -= x
+        elif self.strategy == "best/1":
+            change += best_of(x, fx)[:, None]
+            change -= x
+        return change

@@ -1,0 +1,139 @@
+"""DE-PSO: a particle swarm and a differential evolution that share one global best [dpso2014].
+
+Dai Shaowu, Wang Kehong, Qing Zenghong, "Rapid calibration of accelerometer based on hybrid PSO", 2014. Two
+equal sub-populations evolve in parallel from different halves of the box; after each iteration the better of
+their two best points leads both. The inertia weight and the share of the own position in the differential
+mutation fall along an S-curve; the swarm starts with an inertia above 1 and lives on its velocity limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.optimization.algorithms.de import mutates
+from accelcal_cli.optimization.algorithms.pso import pairs, velocity
+from accelcal_cli.optimization.operators import (
+    Chance,
+    best_of,
+    better_of,
+    drawn,
+    each,
+    gather,
+    integers,
+    partners,
+    press,
+)
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.problem import Problem
+from accelcal_cli.rng import Streams
+from accelcal_cli.schema import setting
+
+
+@dataclass(frozen=True, eq=False)
+class HybridState(State):
+    """Both halves, the swarm first: x and fx are the points of the last evaluation, positions and trials."""
+
+    velocity: Float  # (R, P/2, D)
+    memory: Float  # pbest, then the evolving individuals: what only a better point replaces, (R, P, D)
+    memory_cost: Float  # (R, P)
+    leader: Float  # common best, (R, D)
+    iteration: int
+    chances: tuple[Chance, ...] = ()
+    """r1 and r2 of the swarm, (R, 2, P/2, D), partners n and m of the individuals, (R, 2, P/2), and 1 where a trial
+    takes the mutant's gene, 0 where its parent's, (R, P/2, D)."""
+
+
+@OPTIMIZERS.register("de-pso")
+@dataclass(frozen=True)
+class HybridSwarm(Optimizer):
+    """DE-PSO with the settings of the paper's calibration (section 4.2)."""
+
+    family = "swarm and evolution"
+    paper = "dpso2014"
+
+    population: int = setting(100, "points of both halves together (N)", low=8, high=1_000_000)
+    social: float = setting(2.0, "pull towards the common best (c1)", low=0, high=10)
+    cognitive: float = setting(2.0, "pull towards the own best (c2)", low=0, high=10)
+    inertia_max: float = setting(1.4, "inertia weight before the S-curve (w_max)", low=0, high=10)
+    inertia_min: float = setting(0.2, "inertia weight after it (w_min)", low=0, high=10)
+    own_max: float = setting(1.0, "share of the own position before the S-curve (beta_max)", low=0, high=1)
+    own_min: float = setting(0.1, "share of the own position after it (beta_min)", low=0, high=1)
+    curve_a: float = setting(30.0, "S-curve: a", above=0, high=1e6)
+    curve_b: float = setting(0.88, "S-curve: b", above=0, high=1)
+    weight: float = setting(0.2, "weight of the difference vector (F)", above=0, high=2)
+    crossover: float = setting(0.4, "probability to keep the parent's gene (P_c)", low=0, high=1)
+    speed: float = setting(0.2, "velocity limit as a part of the half box (v_max)", above=0, high=100)
+
+    def init(self, problem: Problem, x: Float, rng: Streams) -> HybridState:
+        """Press the two sub-populations into different halves of the box along the first coordinate."""
+        half = x.shape[1] // 2
+        x = x.copy(order="K")
+        lower, upper = problem.lower[0], problem.upper[0]
+        x[:, :half, 0] = 0.5 * (x[:, :half, 0] + lower)
+        x[:, half:, 0] = 0.5 * (x[:, half:, 0] + upper)
+        fx = problem.cost(x)
+        return HybridState(x, fx, np.zeros_like(x[:, :half]), x, fx, best_of(x, fx), iteration=0)
+
+    def step(self, problem: Problem, state: HybridState, rng: Streams) -> HybridState:
+        """Move both halves once; one call evaluates them together."""
+        now, *ahead = state.chances or self._draw(state, rng)
+        x, v = self._moved(problem, state, now)
+        fx = problem.cost(x)
+        memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
+        leader = best_of(memory, memory_cost)
+        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1, tuple(ahead))
+
+    def _moved(self, problem: Problem, state: HybridState, chance: Chance) -> tuple[Float, Float]:
+        """Return both halves' next points and the swarm's velocities."""
+        (r, picks, taken), curve = chance, self._curve(state.iteration)
+        x, half = np.empty_like(state.x), state.velocity.shape[1]
+        low, high = problem.limits
+        limit = 0.5 * self.speed * (high - low)
+        v = self._velocity(state, r, curve)
+        press(v, -limit, limit)
+        np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
+        individuals = state.memory[:, half:].copy(order="K")
+        change = self._change(individuals, state.leader, picks, curve)
+        change *= taken  # [dpso2014] eq. 5
+        np.add(individuals, change, out=x[:, half:])
+        press(x, low, high)
+        return x, v
+
+    def _draw(self, state: HybridState, rng: Streams) -> tuple[Chance, ...]:
+        """Return what chance decides in the iterations to come."""
+        population, dimensions = state.x.shape[1:]
+        half = state.velocity.shape[1]
+        rest = population - half
+        u = drawn(rng, state.fx, rest, 3 * dimensions + 3)
+        picks = integers(u[..., -3:], rest - 1, rest - 2, dimensions)
+        taken = mutates(u[..., 2 * dimensions : -3], self.crossover, picks[..., 2, :])
+        partners(picks[..., :2, :])
+        return each(pairs(u[:, :, :half, : 2 * dimensions]), picks[..., :2, :], taken)
+
+    def _curve(self, iteration: int) -> float:
+        """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
+        return float(1.0 / (1.0 + self.curve_a * self.curve_b ** (100.0 * iteration / self.iterations)))
+
+    def _velocity(self, state: HybridState, r: Float, curve: float) -> Float:
+        """Return the swarm's velocities before their limit."""
+        half = state.velocity.shape[1]
+        inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
+        x, memory = state.x[:, :half], state.memory[:, :half]
+        return velocity(x, state.velocity, memory, state.leader, r, inertia, self.social, self.cognitive)
+
+    def _change(self, x: Float, leader: Float, picks: Int, curve: float) -> Float:
+        """Return what mutation adds to the evolving half.
+
+        The paper's beta x + (1 - beta) leader is x + (1 - beta) (leader - x).
+        """
+        own = self.own_max - (self.own_max - self.own_min) * curve  # [dpso2014] eq. 9
+        change = gather(x, picks[:, 0])
+        change -= gather(x, picks[:, 1])
+        change *= self.weight
+        pull = leader[:, None] - x
+        pull *= 1.0 - own
+        change += pull  # [dpso2014] eq. 8
+        return change

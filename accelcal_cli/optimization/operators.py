@@ -1,0 +1,96 @@
+"""Operators on whole populations that several optimizers share: drawing, choosing, pressing into the box."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.optimization.problem import Bound, points
+from accelcal_cli.rng import Streams
+
+AHEAD = 1600
+"""Points whose chances are drawn at once: several iterations of a small batch."""
+
+Chance = tuple[NDArray[Any], ...]
+"""What chance decides in one iteration: arrays of shape (R, ...)."""
+
+
+def drawn(rng: Streams, fx: Float, rows: int, columns: int) -> Float:
+    """Return uniform numbers for the iterations to come, shape (R, K, rows, columns), population-contiguous.
+
+    K shrinks with the batch fx, shape (R, P). Each run draws in the order of its iterations, so that its numbers
+    do not depend on its company.
+    """
+    steps = max(1, AHEAD // fx.size)
+    u = rng.uniform(rows, steps * columns).transpose(0, 2, 1)
+    return u.reshape(len(fx), steps, columns, rows).swapaxes(2, 3)
+
+
+def each(*parts: NDArray[Any]) -> tuple[Chance, ...]:
+    """Return arrays of shape (R, K, ...) as the chances of K iterations, one entry an iteration."""
+    return tuple(zip(*(part.swapaxes(0, 1) for part in parts), strict=True))
+
+
+def gather(x: Float, index: Int) -> Float:
+    """Return points of each run's population, x (R, P, D) at index (R, Q): shape (R, Q, D)."""
+    flat = x.transpose(0, 2, 1)
+    if len(flat) == 1:
+        only: Float = flat.take(index[0], axis=2).transpose(0, 2, 1)
+        return only
+    out = np.empty((*flat.shape[:2], index.shape[1]))
+    for source, columns, target in zip(flat, index, out, strict=True):
+        source.take(columns, axis=1, out=target, mode="clip")  # "raise" would copy once more
+    return out.transpose(0, 2, 1)
+
+
+def press(x: Float, low: Bound, high: Bound) -> None:
+    """Press x, shape (R, P, D), between low and high, in place."""
+    if isinstance(low, float):
+        x.clip(low, high, out=x)
+    else:
+        np.maximum(x, low, out=x)
+        np.minimum(x, high, out=x)
+
+
+def better_of(x: Float, fx: Float, new: Float, new_cost: Float) -> tuple[Float, Float]:
+    """Return x and fx with every point replaced whose new one costs less; x, new (R, P, D), costs (R, P)."""
+    better = new_cost < fx
+    return np.where(better[..., None], new, x), np.minimum(new_cost, fx)
+
+
+def best_of(x: Float, fx: Float) -> Float:
+    """Return each run's best point, shape (R, D)."""
+    return points(x, fx.argmin(axis=1))
+
+
+def integers(u: Float, *below: int) -> Int:
+    """Return integers, shape (..., C, P), from uniform numbers, shape (..., P, C); column c is in 0 .. below[c] - 1."""
+    whole: Int = (u.swapaxes(-1, -2) * _column(below)).astype(np.intp)
+    return whole
+
+
+@cache
+def _column(values: tuple[int, ...]) -> Float:
+    return np.array(values, dtype=float)[:, None]
+
+
+def partners(picks: Int) -> tuple[Int, Int]:
+    """Return two distinct partners, neither of them itself, for every individual.
+
+    Args:
+        picks: random integers below P - 1 and below P - 2, shape (..., 2, P), P >= 3; overwritten by the indices.
+
+    Returns:
+        Indices, twice (..., P). Drawn without rejection: the first is so many places further among
+        the P - 1 others, the second among the P - 2 that remain.
+    """
+    first, second = picks[..., 0, :], picks[..., 1, :]
+    second += second >= first
+    size = picks.shape[-1]
+    picks += np.arange(1, size + 1)
+    picks -= size * (picks >= size)
+    return first, second

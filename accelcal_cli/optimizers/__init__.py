@@ -1,1 +1,0 @@
-"""The optimizers: one algorithm a file, and the one loop that runs them."""

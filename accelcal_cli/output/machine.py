@@ -1,0 +1,102 @@
+"""Tables and records for programs: CSV and JSON.
+
+The raw results of a study in a file, one row a run: CSV or Parquet by its suffix.
+
+A simulated raw log as CSV.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from accelcal_cli.output.files import whole_file
+from accelcal_cli.sensor.simulation import Stretch
+from accelcal_cli.table import Table
+
+if TYPE_CHECKING:
+    import polars
+
+
+def write_csv(table: Table, file: IO[str]) -> None:
+    """Write a table as CSV: keys of the columns, then rows; numbers with all their digits, nothing for none."""
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow([column.key or column.name for column in table.columns])
+    inf = math.inf
+    for row in table.rows:
+        # As `_missing` has it; a call for each cell would take longer than writing it.
+        writer.writerow(["" if isinstance(v, float) and not -inf < v < inf else v for v in row])
+
+
+def json_text(record: Any) -> str:
+    """Return a record as JSON text with a line end; it must hold no NaN."""
+    return json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def json_rows(tables: Iterable[Table]) -> list[Any]:
+    """Return the rows of tables as records; NaN and inf become None."""
+    return [
+        {key: None if _missing(value) else value for key, value in record.items()}
+        for table in tables
+        for record in table.records()
+    ]
+
+
+def _missing(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and not math.isfinite(value))
+
+
+def write_raw(table: Table, path: str) -> None:
+    """Write a table whole or not at all; a missing number is an empty cell or a null.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    if path.endswith(".parquet"):
+        with whole_file(path, binary=True) as file:
+            _frame(table).write_parquet(file)
+        return
+    with whole_file(path) as file:
+        write_csv(table, file)
+
+
+def _frame(table: Table) -> polars.DataFrame:
+    """Return a table as polars columns: text, 64-bit integers or 64-bit floats by their format."""
+    import polars
+
+    types = {"": polars.String, "d": polars.Int64}
+    columns = [
+        polars.Series(
+            column.key or column.name,
+            [_finite(row[i]) for row in table.rows],
+            dtype=types.get(column.format, polars.Float64),
+        )
+        for i, column in enumerate(table.columns)
+    ]
+    return polars.DataFrame(columns)
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+DIGITS = "%.9g"
+
+
+def write_log(stretches: Iterable[Stretch], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
+    """Write the rows as they come; return first and last row of each hold, counted from 1."""
+    file.write("t,ax,ay,az" + ",wx,wy,wz" * gyro + "\n")
+    holds, row = [], 0
+    for stretch in stretches:
+        columns = [stretch.time[:, None], stretch.output] + [stretch.gyro] * gyro
+        line = ",".join([DIGITS] * (7 if gyro else 4)) + "\n"
+        file.writelines(line % tuple(cells) for cells in np.hstack(columns).tolist())
+        if stretch.pose:
+            holds.append((row + 1, row + len(stretch.time)))
+        row += len(stretch.time)
+    return holds

@@ -1,0 +1,1 @@
+"""Planning: which poses to take next."""

@@ -1,0 +1,108 @@
+"""Which poses to take next: the ones that shrink the worst dilution of precision most."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.calibration.observability import PRIOR, _score, design, next_poses
+from accelcal_cli.rng import Purpose, Streams
+from accelcal_cli.sensor.poses import fixture_directions, grid
+
+FIXTURES = ("faces", "edges", "corners", "any")
+"""What the sensor can be held against: each allows what those before it allow."""
+
+POWERS = (2.0, 16.0, np.inf)
+"""Norms of the variances that an exchange minimises one after the other: the sum of squares shows the way where the
+largest one alone is tied, the last is the largest itself."""
+
+
+STARTED_POSES, FEWEST_STARTS = 300, 2
+"""Random starts of an exchange: 300 poses over the number chosen, 2 at least."""
+
+
+def candidates(fixture: str) -> Float:
+    """Return the directions that a fixture allows, shape (C, 3), the easiest to hold first.
+
+    `faces`: 6; `edges`: 18, `corners`: 26; `any`: 290, all of them with components in ratios up to 3.
+    """
+    directions = fixture_directions()
+    allowed = {"faces": directions[:6], "edges": directions[:18], "corners": directions}
+    return allowed[fixture] if fixture in allowed else np.concatenate([directions, grid(3)[26:]])
+
+
+def best_poses(information: Float, candidates: Float, count: int) -> list[int]:
+    """Return the indices of the `count` candidates that together leave the smallest largest variance, best first.
+
+    Greedy choice looks one pose ahead. An exchange [fedorov1972] mends that: each pose in turn is replaced by the
+    candidate that suits the others best, until none is. From the greedy choice and from random ones, the best kept.
+    """
+    rows = design(candidates)
+    starts = Streams(0, range(max(FEWEST_STARTS, STARTED_POSES // count)), Purpose.PLAN)
+    drawn = (starts.uniform(1, count)[:, 0] * len(rows)).astype(np.intp)
+    greedy = np.array(next_poses(information, candidates, count), dtype=np.intp)
+    kept, least = greedy, np.inf
+    for start in (greedy, *drawn):
+        chosen = start
+        for power in POWERS:
+            chosen = _exchange(information, rows, chosen, power)
+        reached = float(_score(_variances(information, rows[chosen]), np.inf))
+        if reached < least:
+            kept, least = chosen, reached
+    return [int(kept[i]) for i in next_poses_of(information, candidates[kept])]
+
+
+def distinct_poses(candidates: Float, count: int) -> list[int]:
+    """Return the indices of a set of `count` different candidates, as good from nothing as `best_poses`, best first.
+
+    A set that wants a pose twice gets the best of the other candidates in its place.
+    """
+    chosen: list[int] = []
+    while len(chosen) < count:
+        left = [i for i in range(len(candidates)) if i not in chosen]
+        rows = design(candidates[chosen])
+        more = best_poses(rows.T @ rows, candidates[left], count - len(chosen))
+        chosen += dict.fromkeys(left[i] for i in more)
+    return chosen
+
+
+def next_poses_of(information: Float, directions: Float) -> list[int]:
+    """Return the order in which to take all of some poses, shape (k, 3): each time the one that helps most."""
+    left = list(range(len(directions)))
+    order: list[int] = []
+    while left:
+        (best,) = next_poses(information, directions[left], 1)
+        row = design(directions[[left[best]]])
+        information = information + row.T @ row
+        order.append(left.pop(best))
+    return order
+
+
+def _exchange(information: Float, rows: Float, start: Int, power: float) -> Int:
+    """Return the poses after exchanging one for a better one until no exchange helps."""
+    chosen = start.copy()
+    score = float(_score(_variances(information, rows[chosen]), power))
+    moved = True
+    while moved:
+        moved = False
+        for k in range(len(chosen)):
+            others = rows[np.delete(chosen, k)]
+            after = _variances_with(information + others.T @ others, rows)
+            scores = _score(after, power)
+            best = int(np.argmin(scores))
+            if scores[best] < score:
+                chosen[k], score, moved = best, float(scores[best]), True
+    return chosen
+
+
+def _variances(information: Float, rows: Float) -> Float:
+    """Return the variances after the poses of some design rows, shape (9,)."""
+    return np.diagonal(np.linalg.inv(information + PRIOR * np.eye(9) + rows.T @ rows))
+
+
+def _variances_with(information: Float, rows: Float) -> Float:
+    """Return the variances after each of some poses alone, shape (C, 9): P - P a a^T P / (1 + a^T P a)."""
+    cofactor = np.linalg.inv(information + PRIOR * np.eye(9))
+    gain = rows @ cofactor
+    drop: Float = gain**2 / (1.0 + np.einsum("cp,cp->c", gain, rows))[:, None]
+    return np.diagonal(cofactor) - drop

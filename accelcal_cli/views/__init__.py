@@ -1,0 +1,1 @@
+"""Views: results as tables, headings and number formats for every kind of result."""

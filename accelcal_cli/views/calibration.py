@@ -1,0 +1,296 @@
+"""A calibration as tables: what it shows, in the paper's units and in an engineer's.
+
+What a report shows beside the tables of a calibration: the first numbers, and every pose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED, WEAK
+from accelcal_cli.calibration.result import Calibration, Temperature
+from accelcal_cli.planning.plan import KINDS
+from accelcal_cli.sensor import model as units
+from accelcal_cli.sensor.poses import AXES
+from accelcal_cli.table import Column, Table
+
+WORST_SHOWN = 5
+UNKNOWN, ASSUMED = "not determined", "taken as 0"
+
+
+def tables(result: Calibration) -> list[Table]:
+    """Return every table of a result, in reading order."""
+    warmth = [] if result.temperature is None else [temperature(result, result.temperature)]
+    return [
+        parameters(result),
+        engineering(result),
+        *warmth,
+        fit(result),
+        observability(result),
+        worst_poses(result),
+    ]
+
+
+def parameters(result: Calibration) -> Table:
+    """Return K_a and D_a with their one-sigma."""
+    lost = _undetermined(result)
+    rows = []
+    for i in range(3):
+        row: list[object] = [AXES[i]]
+        for j in range(3):
+            row += _pair(result.K_a[i, j], result.sigma.K_a[i, j], lost=bool(lost[i, j]))
+        row += _pair(result.D_a[i], result.sigma.D_a[i], lost=bool(lost[3, i]))
+        rows.append(row)
+    columns = [Column("axis")]
+    for name in ("K_x", "K_y", "K_z", "bias"):
+        columns += [
+            Column(name, format=".8g"),
+            Column("sigma", format=".2g", key=f"sigma_{name}", beside=True),
+        ]
+    notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
+    if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
+        notes.append(
+            "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
+            "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
+            "gauge lower and the bias."
+        )
+    return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
+
+
+def _undetermined(result: Calibration) -> NDArray[np.bool_]:
+    """Return which entries of K_a (rows 0 to 2) and D_a (row 3) the poses leave undetermined, shape (4, 3)."""
+    nine = result.lost
+    lost = np.zeros((4, 3), dtype=bool)
+    for p, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))):
+        lost[i, j] = lost[j, i] = nine[p]
+    lost[3] = nine[6:]
+    lost[:3] &= result.K_a != 0  # a zero of the gauge is exact
+    return lost
+
+
+def _pair(value: float, sigma: float, *, lost: bool) -> list[object]:
+    """Return a value and its sigma; a value that the poses do not determine is not shown as one."""
+    if lost:
+        return [UNKNOWN, None]
+    return [value, sigma if np.isfinite(sigma) else None]
+
+
+def engineering(result: Calibration) -> Table:
+    """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
+    # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
+    metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
+    # In gauge lower, as their sigma: another gauge, above all the free rotation of gauge full, moves a scale factor
+    # by half the square of the misalignments, which is many times that sigma.
+    K = result.model.in_gauge("lower").K
+    angle = units.misalignment(K)
+    angles = [angle[i, j] + angle[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    bias = units.bias_force(K, result.D_a - result.nominal_bias) / per_g
+    values = np.concatenate([units.scale_error(K, result.nominal_scale), angles, bias])
+    sigma = np.sqrt(np.diagonal(result.covariance)) / per_g
+    shown = (
+        ("scale factor error", "ppm", units.PPM, "%", 100.0),
+        ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
+        ("bias", "micro-g", units.MICRO_G, "m/s^2", metres * per_g),
+    )
+    rows = []
+    for p, name in enumerate(PARAMETERS):
+        kind, unit, factor, second, second_factor = shown[p // 3]
+        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], sigma[p], lost=bool(result.lost[p]))
+        first, again = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
+        rows.append((f"{kind} {name.split()[-1]}", *first, unit, *again, second))
+    columns = (
+        Column("parameter"),
+        Column("value", format=",.6g"),
+        Column("sigma", format=",.3g", beside=True),
+        Column("unit", beside=True),
+        Column("value", format=",.6g", key="value_2"),
+        Column("sigma", format=",.3g", key="sigma_2", beside=True),
+        Column("unit", key="unit_2", beside=True),
+    )
+    return Table("Engineering view", columns, tuple(rows), (_reference(result),))
+
+
+def _times(cell: object, factor: float) -> object:
+    """Return a number times a factor; words and nothing as they are."""
+    return cell * factor if isinstance(cell, float) else cell
+
+
+def _reference(result: Calibration) -> str:
+    """Return the sentence that says what the engineering numbers are relative to."""
+    nominal = f"{result.nominal_scale[0]:.6g}"
+    if np.ptp(result.nominal_scale) > 0:
+        nominal = ", ".join(f"{k:.6g}" for k in result.nominal_scale)
+    offset = ", ".join(f"{d:g}" for d in result.nominal_bias) if result.nominal_bias.any() else "0"
+    return (
+        f"Scale-factor errors against {nominal} output units per {result.unit}, biases against {offset} output units. "
+        "Misalignment: the angle by which two sensor axes miss 90 degrees."
+    )
+
+
+def temperature(result: Calibration, slopes: Temperature) -> Table:
+    """Return the change of scale factors and biases per degree."""
+    force = units.MICRO_G / np.diagonal(result.model.in_gauge("lower").K) / result.g
+    rows = [
+        (
+            f"scale factor {AXES[i]}",
+            slopes.scale[i] * units.PPM,
+            slopes.sigma_scale[i] * units.PPM,
+            "ppm per degree",
+        )
+        for i in range(3)
+    ]
+    rows += [
+        (f"bias {AXES[i]}", slopes.bias[i] * force[i], slopes.sigma_bias[i] * force[i], "micro-g per degree")
+        for i in range(3)
+    ]
+    columns = (
+        Column("parameter"),
+        Column("slope", format=",.2f"),
+        Column("sigma", format=",.2f", beside=True),
+        Column("unit"),
+    )
+    note = (
+        f"The other parameters hold at {slopes.reference:.4g} degrees; the poses went from {slopes.low:.4g} to "
+        f"{slopes.high:.4g}."
+    )
+    return Table("Temperature", columns, tuple(rows), (note,))
+
+
+def fit(result: Calibration) -> Table:
+    """Return how well the readings fit."""
+    unit = result.unit
+    rows: list[tuple[object, ...]] = [
+        ("rms of |f| - g before", f"{result.rms_before:.6g}", unit),
+        ("rms of |f| - g after", f"{result.rms:.6g}", unit),
+        ("noise of one pose, s", f"{result.s:.6g}" if result.freedom > 0 else "-", unit),
+        ("poses", str(result.poses), ""),
+        ("degrees of freedom", str(result.freedom), ""),
+        (f"cost L after {result.optimizer}", f"{result.cost_search:.9g}", f"({unit})^4"),
+        ("cost L after polish", f"{result.cost:.9g}", f"({unit})^4"),
+        ("evaluations", f"{result.evaluations:,}", ""),
+        ("searches in this minimum", f"{result.runs_agreeing} of {result.runs}", ""),
+        ("local gravity g", f"{result.g:.7g}", unit),
+    ]
+    if not result.settings.get("polish", True):
+        rows.pop(6)
+    if result.noise_ratio is not None:
+        rows.insert(3, ("s over scatter within poses", f"{result.noise_ratio:.3g}", ""))
+        rows.insert(4, ("chance of that ratio or more", f"{result.noise_chance:.2g}", ""))
+    notes = (f"Before: {result.before}.",)
+    return Table(
+        "Fit", (Column("quantity"), Column("value"), Column("unit", beside=True)), tuple(rows), notes
+    )
+
+
+def observability(result: Calibration) -> Table:
+    """Return the dilution of precision of each parameter."""
+    rows: list[tuple[object, ...]] = []
+    for (name, dop), held in zip(result.dop.parameters.items(), result.held, strict=True):
+        if held:
+            rows.append((name, "-", ASSUMED))
+            continue
+        word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
+        rows.append((name, dop if np.isfinite(dop) else "infinite", word))
+    notes = (
+        "Dilution of precision: how many times the noise of one pose the error of a parameter comes out "
+        f"(as {result.unit} at 1 g). Above {WEAK:g} weak, above {UNDETERMINED:g} undetermined.",
+    )
+    columns = (Column("parameter"), Column("DOP", format=".3f"), Column(""))
+    return Table("Observability", columns, tuple(rows), notes)
+
+
+def worst_poses(result: Calibration) -> Table:
+    """Return the poses with the largest studentised residuals, and those named as outliers."""
+    size = [abs(p.residual if np.isnan(p.studentised) else p.studentised) for p in result.poses_fit]
+    order = np.argsort(-np.array(size), kind="stable")[:WORST_SHOWN]
+    rows = tuple(
+        (
+            p.where,
+            p.residual,
+            p.studentised,
+            p.leverage,
+            p.left_out,
+            "outlier" if p.pose in result.outliers else "",
+        )
+        for p in (result.poses_fit[i] for i in order)
+    )
+    unit = result.unit
+    columns = (
+        Column("pose"),
+        Column("|f| - g", unit, ".3e"),
+        Column("studentised", format=".2f"),
+        Column("leverage", format=".2f"),
+        Column("left out", unit, ".3e"),
+        Column(""),
+    )
+    return Table("Worst poses", columns, rows)
+
+
+def values(result: Calibration) -> Table:
+    """Return the parameters one a row, for CSV; one that is not determined has no value."""
+    lost = _undetermined(result)
+    names = [f"K_{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)] + ["D_1", "D_2", "D_3"]
+    entries = (
+        np.concatenate([result.K_a, [result.D_a]]),
+        np.concatenate([result.sigma.K_a, [result.sigma.D_a]]),
+    )
+    units_ = [f"output units per {result.unit}"] * 9 + ["output units"] * 3
+    rows: list[tuple[object, ...]] = [
+        (name, None if gone else value, None if gone else sigma, unit)
+        for name, value, sigma, gone, unit in zip(
+            names, *(e.ravel().tolist() for e in entries), lost.ravel().tolist(), units_, strict=True
+        )
+    ]
+    rows += [
+        ("cost", result.cost, None, f"({result.unit})^4"),
+        ("rms", result.rms, None, result.unit),
+        ("g", result.g, None, result.unit),
+        ("verdict", result.verdict, None, ""),
+    ]
+    columns = (Column("parameter"), Column("value"), Column("sigma"), Column("unit"))
+    return Table("Calibration", columns, tuple(rows))
+
+
+def pose_residuals(result: Calibration) -> Table:
+    """Return every kept pose: residual before and after calibration, and the direction that pointed up."""
+    unit = result.unit
+    columns = (
+        Column("pose"),
+        Column("before", unit, ".3e"),
+        Column("after", unit, ".3e"),
+        Column("studentised", format=".2f"),
+        Column("leverage", format=".2f"),
+        *(Column(axis, format=".3f") for axis in AXES),
+    )
+    rows = tuple(
+        (p.where, p.residual_before, p.residual, p.studentised, p.leverage, *p.direction)
+        for p in result.poses_fit
+    )
+    notes = ("Before, after: |f| - g. x, y, z: unit direction of the specific force, gauge lower.",)
+    return Table("Poses", columns, rows, notes)
+
+
+def accuracy(result: Calibration) -> str:
+    """Say in one sentence how well the parameters are known; nothing where the poses do not tell."""
+    variance = np.diagonal(result.covariance)
+    if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(variance).all():
+        return ""
+    sigma = np.sqrt(variance) / result.g
+    largest = [(name, sigma[kind].max() * size, unit) for name, kind, unit, size in KINDS]
+    parts = [f"{name} {v:{'.2g' if v < 100 else ',.0f'}} {unit}" for name, v, unit in largest if v > 0]
+    return f"Largest one-sigma of each kind: {', '.join(parts)}."
+
+
+def headline(result: Calibration) -> list[tuple[str, str]]:
+    """Return the few numbers that a reader wants first, name and value."""
+    unit = result.unit
+    worst = f"{result.dop.worst:.3g}" if np.isfinite(result.dop.worst) else "infinite"
+    return [
+        ("rms of |f| - g before", f"{result.rms_before:.3g} {unit}"),
+        ("rms of |f| - g after", f"{result.rms:.3g} {unit}"),
+        ("noise of one pose, s", f"{result.s:.3g} {unit}" if result.freedom > 0 else "-"),
+        ("worst dilution of precision", worst),
+        ("poses", f"{result.poses:,}"),
+        ("local gravity g", f"{result.g:.6g} {unit}"),
+    ]

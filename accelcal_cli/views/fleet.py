@@ -1,0 +1,199 @@
+"""A fleet as tables: one row a sensor for programs, a summary for people."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.calibration.fleet import FAILED, Fleet, Quantity, Standout, noise, parameters
+from accelcal_cli.calibration.observability import PARAMETERS
+from accelcal_cli.table import Column, Table
+
+SHOWN = 10
+"""Sensors of one kind that the summary names."""
+
+WORST = 5
+"""Sensors with the largest rms that the summary names."""
+
+CLAUSE = re.compile(r"[:.] ")
+"""Where the first clause of a caution ends."""
+
+QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
+VERDICTS = ("good", "weak", "undetermined", FAILED)
+
+
+def sensors(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout]) -> Table:
+    """Return one row a sensor: verdict, parameters with sigma, dilution of precision, fit, and what is wrong."""
+    entries = [(i, j) for i in range(3) for j in range(3)]
+    numbers: list[tuple[str, Float]] = [
+        *((f"K_{i + 1}{j + 1}", fleet.K_a[:, i, j]) for i, j in entries),
+        *((f"D_{i + 1}", fleet.D_a[:, i]) for i in range(3)),
+        *((f"sigma_K_{i + 1}{j + 1}", fleet.sigma_k[:, i, j]) for i, j in entries),
+        *((f"sigma_D_{i + 1}", fleet.sigma_d[:, i]) for i in range(3)),
+        *((f"dop_{name.replace(' ', '_')}", fleet.dop[:, p]) for p, name in enumerate(PARAMETERS)),
+        ("rms", fleet.rms),
+        ("rms_before", fleet.rms_before),
+        ("s", fleet.s),
+        ("cost", fleet.cost),
+    ]
+    apart = np.full(len(labels), "", dtype=object)
+    for one in found:
+        apart[one.at] += ("; " if apart[one.at] else "") + one.quantity.name
+    columns = (
+        Column("sensor"),
+        Column("verdict"),
+        Column("poses", format="d"),
+        *(Column(name, format=".9g") for name, _ in numbers),
+        Column("outlying poses", key="outlying_poses"),
+        Column("stands out", key="stands_out"),
+        Column("reason"),
+        Column("caution"),
+    )
+    lists = (
+        [labels, fleet.verdict.tolist(), fleet.poses.tolist()]
+        + [values.tolist() for _, values in numbers]
+        + [fleet.outlying.tolist(), apart.tolist(), fleet.reason.tolist(), fleet.caution.tolist()]
+    )
+    return Table("Sensors", columns, tuple(zip(*lists, strict=True)))
+
+
+def counts(fleet: Fleet) -> str:
+    """Return how many sensors there are of each verdict, and how many with a caution, in words."""
+    each = {word: int((fleet.verdict == word).sum()) for word in VERDICTS}
+    listed = ", ".join(f"{n:,} {word}" for word, n in each.items() if n)
+    warned = int((fleet.caution != "").sum())
+    beside = f", {warned:,} of them with a caution" if warned else ""
+    return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{beside}"
+
+
+def summary(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: float) -> list[Table]:
+    """Return what a person wants to know of a fleet, in reading order."""
+    tables = []
+    if fleet.determined.any():
+        tables += [_spread(fleet, g), _worst(fleet, labels, g)]
+    warned = np.flatnonzero(fleet.caution != "")
+    if len(warned):
+        tables.append(_warned(fleet, labels, warned, g))
+    if found:
+        tables.append(_apart(labels, found))
+    bad = np.flatnonzero(fleet.verdict != "good")
+    if len(bad):
+        tables.append(_not_good(fleet, labels, bad))
+    return tables
+
+
+def _spread(fleet: Fleet, g: float) -> Table:
+    """Return quantiles of parameters, fit and dilution of precision over the sensors with a verdict to use."""
+    known = fleet.determined
+    unit = "g" if g == 1.0 else "m/s^2"
+    quantities = [
+        *parameters(fleet, g),
+        Quantity("rms of |f| - g before", unit, ".4g", fleet.rms_before),
+        Quantity("rms of |f| - g after", unit, ".4g", fleet.rms),
+        noise(fleet, g),
+        Quantity("worst dilution of precision", "", ".3f", fleet.dop.max(axis=1)),
+    ]
+    rows = []
+    for quantity in quantities:
+        values = quantity.values[known]
+        values = values[np.isfinite(values)]
+        if len(values):
+            row = np.quantile(values, QUANTILES).tolist()
+            rows.append((quantity.name, *(format(v, quantity.format) for v in row), quantity.unit))
+    columns = ("quantity", "least", "5 %", "median", "95 %", "greatest", "unit")
+    note = "Scale factors, misalignments and biases in gauge lower, of the sensors that are good or weak."
+    return Table("Fleet", tuple(Column(name) for name in columns), tuple(rows), (note,))
+
+
+def _worst(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
+    """Return the sensors with the largest rms."""
+    size = np.where(fleet.determined, fleet.rms, -1.0)
+    order = np.argsort(-size, kind="stable")[: min(WORST, int(fleet.determined.sum()))]
+    unit = "g" if g == 1.0 else "m/s^2"
+    columns = (
+        Column("sensor"),
+        Column("rms after", unit, ".4g"),
+        Column("rms before", unit, ".4g"),
+        Column("s", unit, ".3g"),
+        Column("worst DOP", format=".3f"),
+        Column("poses", format="d"),
+        Column("outlying poses"),
+    )
+    rows = [
+        (
+            labels[r],
+            float(fleet.rms[r]),
+            float(fleet.rms_before[r]),
+            float(fleet.s[r]),
+            float(fleet.dop[r].max()),
+            int(fleet.poses[r]),
+            str(fleet.outlying[r]),
+        )
+        for r in order
+    ]
+    return Table("Worst fit", columns, tuple(rows), _more(int((fleet.outlying != "").sum())))
+
+
+def _more(outlying: int) -> tuple[str, ...]:
+    if not outlying:
+        return ()
+    return (f"Sensors with poses beyond chance: {outlying:,} (column outlying_poses of --format csv).",)
+
+
+def _apart(labels: Sequence[str], found: Sequence[Standout]) -> Table:
+    """Return the sensors that stand out from the fleet."""
+    rows = tuple(
+        (
+            labels[one.at],
+            one.quantity.name,
+            format(one.value, one.quantity.format),
+            format(one.middle, one.quantity.format),
+            one.quantity.unit,
+            one.z,
+        )
+        for one in found[:SHOWN]
+    )
+    columns = (
+        Column("sensor"),
+        Column("quantity"),
+        Column("value"),
+        Column("fleet"),
+        Column("unit"),
+        Column("z", format="+.1f"),
+    )
+    notes = [
+        "z: distance from the median in standard deviations of the fleet, by its median absolute deviation."
+    ]
+    if len(found) > SHOWN:
+        notes.append(f"And {len(found) - SHOWN:,} more (column stands_out of --format csv).")
+    return Table("Stand out from the fleet", columns, rows, tuple(notes))
+
+
+def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table:
+    """Return the sensors with cautions, the noisiest first; of each its first caution in short."""
+    order = warned[np.argsort(-np.nan_to_num(fleet.s[warned]), kind="stable")][:SHOWN]
+    rows = tuple(
+        (labels[r], 100.0 * float(fleet.s[r]) / g, fleet.outlying[r], CLAUSE.split(fleet.caution[r])[0])
+        for r in order
+    )
+    notes = ["s: standard deviation of a pose. Whole sentences: column caution of --format csv."]
+    if len(warned) > SHOWN:
+        notes.append(f"And {len(warned) - SHOWN:,} more.")
+    columns = (
+        Column("sensor"),
+        Column("s", "% of g", ".3g"),
+        Column("outlying poses"),
+        Column("caution"),
+    )
+    return Table("Cautions", columns, rows, tuple(notes))
+
+
+def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
+    """Return the sensors whose verdict is not good, the worst verdict first."""
+    order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
+    rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r]) for r in order[:SHOWN])
+    notes = (f"And {len(bad) - SHOWN:,} more.",) if len(bad) > SHOWN else ()
+    return Table("Not good", (Column("sensor"), Column("verdict"), Column("why")), rows, notes)

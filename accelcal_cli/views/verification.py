@@ -1,0 +1,64 @@
+"""A verification as tables: parameter by parameter, and the tests."""
+
+from __future__ import annotations
+
+from accelcal_cli.calibration.observability import MISALIGNMENT, PARAMETERS, SCALE
+from accelcal_cli.sensor import model as units
+from accelcal_cli.table import Column, Table
+from accelcal_cli.verification.verify import Difference, Verification
+
+MICRO_RAD = 1000.0 * units.MRAD
+
+
+def differences(result: Verification) -> Table:
+    """Return the nine differences, new minus old, in an engineer's units."""
+    rows = tuple(_row(d, result) for d in result.differences)
+    columns = (
+        Column("parameter"),
+        Column("new - old", format=",.1f", key="difference"),
+        Column("sigma", format=",.1f"),
+        Column("unit"),
+        Column("chance", format=".2g"),
+        Column("adjusted", format=".2g"),
+        Column("", key="changed"),
+    )
+    note = (
+        "Chance: of a difference as large when nothing changed; adjusted: the same with nine looks taken into "
+        "account (Holm)."
+    )
+    return Table("Differences", columns, rows, (note,))
+
+
+def _row(d: Difference, result: Verification) -> tuple[object, ...]:
+    """Return one parameter; those of the inverse matrix change sign, so that they are of K_a."""
+    if d.name in PARAMETERS[SCALE]:
+        factor, unit = -units.PPM / result.g, "ppm"
+    elif d.name in PARAMETERS[MISALIGNMENT]:
+        factor, unit = -MICRO_RAD / result.g, "micro-rad"
+    else:
+        factor, unit = units.MICRO_G / result.g, "micro-g"
+    if d.value != d.value:
+        return (d.name, None, None, unit, None, None, "not determined")
+    changed = "changed" if d.changed else ""
+    return (d.name, d.value * factor + 0.0, d.sigma * abs(factor), unit, d.chance, d.adjusted, changed)
+
+
+def evidence(result: Verification) -> Table:
+    """Return what the verdict rests on."""
+    unit = result.unit
+    rows: list[tuple[object, ...]] = [
+        ("chance that an unchanged sensor looks so", f"{result.chance:.3g}", ""),
+        ("level", f"{result.level:g}", ""),
+        (f"chi-square of {result.directions} directions", f"{result.chi_square:.4g}", ""),
+        ("its chance", f"{result.chance_together:.3g}", ""),
+        ("noise of one pose, old", f"{result.s_old:.6g}", unit),
+        ("noise of one pose, new", f"{result.s_new:.6g}" if result.freedom > 0 else "-", unit),
+        ("rms of |f| - g under the old result", f"{result.rms:.6g}", unit),
+        ("poses", str(result.poses), ""),
+        ("local gravity g", f"{result.g:.7g}", unit),
+    ]
+    if result.freedom > 0:
+        rows.insert(6, ("chance of so different a noise", f"{result.noise_chance:.2g}", ""))
+    if result.tolerance is not None:
+        rows.insert(-2, ("tolerance", f"{result.tolerance:g}", unit))
+    return Table("Tests", (Column("quantity"), Column("value"), Column("unit")), tuple(rows))
