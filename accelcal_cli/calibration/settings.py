@@ -27,6 +27,9 @@ ALIGNED = {
 }
 """What goes with axes that are taken as perpendicular."""
 
+KNOWN = {"robust": ("none",), "weights": ("none", "n", "sd")}
+"""What goes with known attitudes."""
+
 
 @dataclass(frozen=True)
 class BoxSettings:
@@ -86,13 +89,15 @@ class Settings:
     def __post_init__(self) -> None:
         """Refuse a setting outside its range, and what does not go with perpendicular axes."""
         check(self)
-        if self.misalignment:
-            return
-        for key, allowed in ALIGNED.items():
-            if getattr(self, key) not in allowed:
-                raise ConfigError(
-                    f"{key}: {getattr(self, key)} does not go with misalignment: false; expected {' or '.join(allowed)}"
-                )
+        for applies, words, limits in (
+            (not self.misalignment, "misalignment: false", ALIGNED),
+            (self.attitudes == "known", "--attitudes known", KNOWN),
+        ):
+            for key, allowed in limits.items() if applies else ():
+                if getattr(self, key) not in allowed:
+                    raise ConfigError(
+                        f"{key}: {getattr(self, key)} does not go with {words}; expected {' or '.join(allowed)}"
+                    )
 
     def build_optimizer(self) -> Optimizer:
         """Return the optimizer with its parameters.

@@ -42,7 +42,9 @@ def test_six_faces_determine_scale_factors_and_biases(optimizer):
     np.testing.assert_allclose(result.K_a, ALIGNED.K, atol=1e-9 * ALIGNED.K[0, 0])
     np.testing.assert_allclose(result.D_a, ALIGNED.D, atol=1e-8 * ALIGNED.K[0, 0])
     assert (result.verdict, result.freedom) == ("weak", 0)
-    assert result.reasons == ("Six poses leave nothing to judge their noise by: no sigma. Take at least 12.",)
+    assert result.reasons == (
+        "Six poses leave no degrees of freedom, so no uncertainty can be given. Take at least 12.",
+    )
     assert result.dop.scale == pytest.approx(np.sqrt(0.5), rel=1e-2)
     assert result.dop.misalignment == 0
     assert any("taken as perpendicular" in caution for caution in result.cautions)
