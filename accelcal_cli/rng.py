@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeVarTuple, Unpack, cast
+from typing import TypeVarTuple, cast
 
 import numpy as np
 from numpy.random import SFC64, Generator, SeedSequence
@@ -24,8 +24,8 @@ from accelcal_cli.arrays import Float, Int
 
 Arrays = TypeVarTuple("Arrays")
 
-AHEAD = 32 * 1024
-"""Numbers that a batch draws ahead at most, 256 KiB: several iterations of a few runs, within the second-level cache."""
+AHEAD = 40 * 1024
+"""Numbers that a batch draws ahead at most, 320 KiB: several iterations of a few runs, in the second-level cache."""
 
 
 class Purpose(IntEnum):
@@ -122,9 +122,7 @@ class Streams:
             generator.standard_normal(out=part)
         return out.transpose(0, 2, 1)
 
-    def ahead(
-        self, choose: Callable[[Float], tuple[Unpack[Arrays]]], rows: int, columns: int
-    ) -> tuple[Unpack[Arrays]]:
+    def ahead(self, choose: Callable[[Float], tuple[*Arrays]], rows: int, columns: int) -> tuple[*Arrays]:
         """Return what `choose` makes of `uniform(rows, columns)`, computed for several iterations in one call.
 
         The same bits as without drawing ahead, whatever is drawn before or after.
@@ -141,11 +139,9 @@ class Streams:
         if stock is None or stock.used == stock.steps or stock.key != key:
             stock = self._stock = self._draw_ahead(choose, rows, columns)
         stock.used += 1
-        return cast("tuple[Unpack[Arrays]]", next(stock.arrays))
+        return cast("tuple[*Arrays]", next(stock.arrays))
 
-    def _draw_ahead(
-        self, choose: Callable[[Float], tuple[Unpack[Arrays]]], rows: int, columns: int
-    ) -> _Stock:
+    def _draw_ahead(self, choose: Callable[[Float], tuple[*Arrays]], rows: int, columns: int) -> _Stock:
         steps = max(1, AHEAD // (len(self) * rows * columns))
         # A stock of one iteration is used up at once: nothing will be given back.
         states = [g.bit_generator.state for g in self.generators] if steps > 1 else []

@@ -28,7 +28,7 @@ from accelcal_cli.schema import setting
 
 @OPTIMIZERS.register("de")
 @dataclass(frozen=True)
-class DifferentialEvolution(Optimizer):
+class DifferentialEvolution(Optimizer[State]):
     """Differential evolution with greedy selection."""
 
     family = "evolution"
@@ -60,7 +60,7 @@ class DifferentialEvolution(Optimizer):
         return State(*better_of(x, fx, trial, problem.cost(trial)))  # [dpso2014] eq. 6
 
     def _choices(self, u: Float) -> tuple[Int, Float]:
-        """Return partners n, m and base vector, (R, K, 3, P), and where a trial takes the mutant's gene, (R, K, P, D)."""
+        """Return n, m and base vector, shape (R, K, 3, P), and 1 where a trial takes the mutant's gene, else 0."""
         population, dimensions = u.shape[2], u.shape[3] - 4
         picks = integers(u[..., :4], population - 1, population - 2, population, dimensions)
         keep = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover

@@ -42,7 +42,7 @@ class HybridState(State):
 
 @OPTIMIZERS.register("de-pso")
 @dataclass(frozen=True)
-class HybridSwarm(Optimizer):
+class HybridSwarm(Optimizer[HybridState]):
     """DE-PSO with the settings of the paper's calibration (section 4.2)."""
 
     family = "swarm and evolution"

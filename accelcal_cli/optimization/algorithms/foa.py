@@ -29,7 +29,7 @@ class PlaneState(State):
 
 @OPTIMIZERS.register("foa")
 @dataclass(frozen=True)
-class FruitFly(Optimizer):
+class FruitFly(Optimizer[PlaneState]):
     """FOA as published: candidates are reciprocal distances."""
 
     family = "fruit fly"

@@ -34,7 +34,7 @@ class FilterState(State):
 
 @OPTIMIZERS.register("kpso")
 @dataclass(frozen=True)
-class KalmanSwarm(Optimizer):
+class KalmanSwarm(Optimizer[FilterState]):
     """Kalman swarm of Monson and Seppi."""
 
     family = "swarm"

@@ -58,7 +58,7 @@ def velocity(
 
 @OPTIMIZERS.register("pso")
 @dataclass(frozen=True)
-class ParticleSwarm(Optimizer):
+class ParticleSwarm(Optimizer[SwarmState]):
     """Particle swarm optimization."""
 
     family = "swarm"
