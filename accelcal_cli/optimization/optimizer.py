@@ -81,6 +81,8 @@ class Optimizer(ABC, Generic[S]):
     """Key of docs/bibliography.md."""
     needs: ClassVar[tuple[str, ...]] = ()
     """What the problem must offer: "residuals", "closed_form"."""
+    converges: ClassVar[bool] = True
+    """False for a search whose radius or noise never shrinks, so that the cost stays on a floor."""
 
     population: int = setting(100, "points that are evaluated together (N)", low=4, high=1_000_000)
     iterations: int = setting(500, "steps at most (k_max)", low=1, high=100_000_000)

@@ -9,7 +9,7 @@ from multiprocessing import get_context
 import optimizer_contract as contract
 import pytest
 
-from accelcal_cli.config import load_mapping, shipped
+from accelcal_cli.config import load_mapping, optimizer_file
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, State
 
@@ -121,7 +121,7 @@ def test_the_contract_sees_runs_that_share_their_random_numbers(monkeypatch):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_optimizer_ships_its_settings(name):
     """One YAML file an algorithm: it names its source and states every setting there is."""
-    record = load_mapping(shipped("optimizers")[name])
+    record = load_mapping(optimizer_file(name))
     cls = OPTIMIZERS.get(name)
     assert record["optimizer"] == name
     assert record["source"]

@@ -39,6 +39,7 @@ class KalmanSwarm(Optimizer[FilterState]):
 
     family = "swarm"
     paper = "monson2004"
+    converges = False
 
     noise: float = setting(
         0.01, "variance of start, process and observation as part of the range (epsilon)", above=0
