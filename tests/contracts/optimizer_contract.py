@@ -37,15 +37,17 @@ SHORT: Mapping[str, Mapping[str, Any]] = {
 }
 """Settings where 60 iterations do not pass through all that the algorithm does."""
 
-FLOORS: Mapping[str, float] = {"sphere": 0.08, "rosenbrock": 0.12, "residuals": 4e-3, "calibration": 0.5}
-"""The cost that counts as reached, by case, for an optimizer that does not converge: swarms with a radius or a noise
-that never shrinks stay on a floor. It is still several times below what random search finds."""
+FLOORS: Mapping[str, float] = {"sphere": 0.01, "rosenbrock": 2e-3, "residuals": 2e-5, "calibration": 0.1}
+"""The cost that counts as reached, by case, for an optimizer that does not converge. Less than one run of random
+search in fifty finds it within the largest budget."""
 
 REACHED: Mapping[str, Mapping[str, float]] = {
-    "full-foa": {"rosenbrock": 0.1},
+    "foa": {"rosenbrock": 0.12},
+    "full-foa": {"sphere": 0.08, "rosenbrock": 0.1, "residuals": 4e-3, "calibration": 0.5},
     "kpso": {"sphere": 0.06, "rosenbrock": 0.08, "residuals": 1.2e-3, "calibration": 0.2},
 }
-"""A lower floor, by optimizer and case."""
+"""A higher floor, by optimizer and case: swarms with a radius or a noise that never shrinks. It is still several times
+below what random search finds in as many evaluations."""
 
 BEYOND: Mapping[str, tuple[str, ...]] = {"foa": ("sphere", "residuals", "calibration")}
 """Minima that an algorithm as published cannot reach (FOA's candidates are positive and near its swarm's radius)."""
