@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.schema import check, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
@@ -99,7 +99,7 @@ class Settings:
                         f"{key}: {getattr(self, key)} does not go with {words}; expected {' or '.join(allowed)}"
                     )
 
-    def build_optimizer(self) -> Optimizer:
+    def build_optimizer(self) -> Optimizer[State]:
         """Return the optimizer with its parameters.
 
         Raises:
