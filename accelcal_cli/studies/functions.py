@@ -1,13 +1,10 @@
-"""Test functions with known minima: those of the papers and the standard ones a reader expects.
+"""Test functions with known minima: those of the papers, and standard ones from the literature.
 
 All have the minimum 0 at a known point. The optimum may be moved off the centre of the box and the coordinates
-rotated about it: an optimizer that only finds the centre, or only moves along the axes, is exposed.
+rotated about it: that exposes an optimizer that only finds the centre, or only moves along the axes.
 
-The formulas of the test functions of z, shape (..., D); each returns costs of shape (...).
-
-Test functions that are sums of squares: their residuals and Jacobians, for least-squares methods.
-
-z has the shape (..., D), residuals (..., M), Jacobians (..., M, D).
+The formulas take z, shape (..., D), and return costs of shape (...). Functions that are sums of squares also have
+residuals, shape (..., M), and Jacobians, shape (..., M, D), for least-squares methods.
 """
 
 from __future__ import annotations
@@ -187,7 +184,7 @@ ZAKHAROV = Squares(_zakharov, _zakharov_jacobian)
 
 
 MARGIN = 0.1
-"""A moved optimum keeps this part of the half box from the walls."""
+"""A moved optimum stays away from the walls by this part of the half-width of the box."""
 
 
 @dataclass(frozen=True)
@@ -237,14 +234,14 @@ def _unknown(name: str) -> str:
 
 
 class TestFunction(Problem):
-    """A test function over its box, its optimum possibly moved and its coordinates turned.
+    """A test function over its box, with its optimum moved or its coordinates rotated if wanted.
 
     Args:
         name: key of FUNCTIONS.
         dimensions: D >= 2.
         shift: move the optimum to a random place in the box.
-        rotate: turn the coordinates about the optimum by a random rotation.
-        seed: of place and rotation.
+        rotate: rotate the coordinates about the optimum at random.
+        seed: of position and rotation.
 
     Raises:
         ConfigError: no such function.
@@ -256,24 +253,21 @@ class TestFunction(Problem):
     def __init__(
         self, name: str, dimensions: int, *, shift: bool = False, rotate: bool = False, seed: int = 0
     ) -> None:
-        """Draw the place of the optimum and the rotation."""
+        """Draw the position of the optimum and the rotation."""
         if name not in FUNCTIONS:
             raise ConfigError(_unknown(name))
         definition = FUNCTIONS[name]
         self.name, self.definition = name, definition
-        self.lower, self.upper = (
-            np.full(dimensions, float(definition.low)),
-            np.full(dimensions, float(definition.high)),
-        )
+        self.lower, self.upper = np.full((2, dimensions), [[float(definition.low)], [float(definition.high)]])
         if definition.start:
             low, high = definition.start
             self.start = np.full(dimensions, low), np.full(dimensions, high)
         stream = Streams(seed, [0], Purpose.SHIFT)
         centre, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-        place = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions)[0, 0] - 1.0)
-        self.optimum = place if shift else np.full(dimensions, definition.optimum)
+        position = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions)[0, 0] - 1.0)
+        self.optimum = position if shift else np.full(dimensions, definition.optimum)
         self._offset = self.optimum - definition.optimum if shift else None
-        self._turn = np.linalg.qr(stream.normal(dimensions, dimensions)[0])[0] if rotate else None
+        self._rotation = np.linalg.qr(stream.normal(dimensions, dimensions)[0])[0] if rotate else None
 
         self.has_residuals = definition.squares is not None
 
@@ -288,18 +282,18 @@ class TestFunction(Problem):
     def jacobian(self, x: Float) -> Float:
         """Return the derivatives of the residuals; see `Problem.jacobian`."""
         inner = self._squares().jacobian(self._inner(x))
-        return inner if self._turn is None else inner @ self._turn
+        return inner if self._rotation is None else inner @ self._rotation
 
     def _squares(self) -> Squares:
         if self.definition.squares is None:
-            raise NotImplementedError(f"{self.name} is no sum of squares")
+            raise NotImplementedError(f"{self.name} is not a sum of squares")
         return self.definition.squares
 
     def _inner(self, x: Float) -> Float:
-        """Return z, where the formula has its optimum at its own place and its own axes."""
+        """Return z: x in the coordinates of the formula."""
         z = x if self._offset is None else x - self._offset
-        if self._turn is None:
+        if self._rotation is None:
             return z
         away = z - self.definition.optimum
-        turned: Float = (self._turn @ away.swapaxes(1, 2)).swapaxes(1, 2) + self.definition.optimum
+        turned: Float = (self._rotation @ away.swapaxes(1, 2)).swapaxes(1, 2) + self.definition.optimum
         return turned
