@@ -11,11 +11,10 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, DataError, did_you_mean
@@ -28,15 +27,54 @@ from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR, PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.schema import build, check, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
-from accelcal_cli.studies.study import Record, Study, Task, records_of_cell
+from accelcal_cli.studies.study import Record, Row, Study, Task, records_of_cell
 
 
 @dataclass(frozen=True)
-class ScenarioSettings:
-    """Map, voyage, INS and gravimeter of a study.
+class FilterEntry:
+    """A filter in a study: its name, its label in the tables, and the settings that differ from its defaults.
+
+    Raises:
+        ConfigError: an unknown filter or setting, or a value that the filter does not permit.
+    """
+
+    filter: str
+    label: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what the filter does not know."""
+        self.build()
+
+    def build(self) -> Filter:
+        """Return the filter."""
+        return FILTERS.build(self.filter, self.parameters, self.name)
+
+    @property
+    def name(self) -> str:
+        """Its label, or else the name of the filter."""
+        return self.label or self.filter
+
+    def with_settings(self, stated: Mapping[str, Any]) -> FilterEntry:
+        """Return the filter with settings of the command line; None, and a setting that it lacks, are left out."""
+        known = {f.name for f in fields(FILTERS.get(self.filter))}  # type: ignore[arg-type]
+        own = {name: value for name, value in stated.items() if value is not None and name in known}
+        return replace(self, parameters={**self.parameters, **own})
+
+
+def filter_names() -> list[str]:
+    """Return the names of all filters, in the order of the tables."""
+    order = ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
+    return sorted(FILTERS.names(), key=lambda name: order.index(name) if name in order else len(order))
+
+
+@dataclass(frozen=True)
+class NavigationSettings:
+    """Map, voyage, INS, gravimeter and filters of a study; its fields are the keys of its file.
 
     Attributes:
         plan: the planned voyage; ins: its INS.
+        paper: RMSE of the position that a paper reports, m, by filter.
     """
 
     map: str = setting(
@@ -44,11 +82,18 @@ class ScenarioSettings:
     )
     map_seed: int | None = setting(None, "of a generated map; not set: the study's seed", low=0)
     voyage: str = setting("", "CSV file of a recorded voyage; without one the voyage is planned")
-    plan: PlannedVoyage = field(default_factory=PlannedVoyage, metadata={"doc": "the planned voyage"})
-    ins: InsGrade = field(default_factory=InsGrade, metadata={"doc": "the INS"})
+    plan: PlannedVoyage = setting(PlannedVoyage(), "the planned voyage")
+    ins: InsGrade = setting(InsGrade(), "the INS")
     period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
     noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", low=1e-3, high=1000.0)
     initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
+    runs: int = setting(20, "runs of each filter", low=1, high=100_000)
+    seed: int = setting(0, "seed of all random numbers", low=0)
+    filters: tuple[FilterEntry, ...] = ()
+    title: str = ""
+    source: str = ""
+    note: str = ""
+    paper: dict[str, Any] = field(default_factory=dict)
     digests: str = field(default="", metadata={"doc": "SHA-256 of the files"})
 
     def __post_init__(self) -> None:
@@ -66,7 +111,7 @@ class ScenarioSettings:
         """Return the files that are read: a map that is not generated, and a recorded voyage."""
         return [path for path in ("" if self.map in PRESETS else self.map, self.voyage) if path]
 
-    def with_digests(self) -> ScenarioSettings:
+    def with_digests(self) -> NavigationSettings:
         """Return the settings with the hashes of their files, so that other contents make another study."""
         if self.map not in PRESETS and not Path(self.map).suffix and not Path(self.map).exists():
             raise ConfigError(
@@ -75,19 +120,19 @@ class ScenarioSettings:
             )
         return replace(self, digests=" ".join(map(digest, self.files())))
 
-    def gravity_map(self, seed: int) -> GravityMap:
+    def gravity_map(self) -> GravityMap:
         """Return the map. Raises DataError when its file cannot be used."""
         if self.map not in PRESETS:
             return load_map(self.map)
-        return generate(PRESETS[self.map], seed if self.map_seed is None else self.map_seed, self.map)
+        return generate(PRESETS[self.map], self.seed if self.map_seed is None else self.map_seed, self.map)
 
-    def scenario(self, grade: InsGrade, runs: range, seed: int) -> Scenario:
+    def scenario(self, grade: InsGrade, runs: range) -> Scenario:
         """Return the scenario of some runs; the map must cover its trajectory.
 
         Raises:
             DataError: a file that cannot be used, or a map that ends near the trajectory.
         """
-        gravity_map, noise, initial = self.gravity_map(seed), self.noise, self.initial
+        gravity_map, seed, noise, initial = self.gravity_map(), self.seed, self.noise, self.initial
         if self.voyage:
             columns = read_voyage(self.voyage, self.period)
             recorded = from_recording(
@@ -101,82 +146,18 @@ class ScenarioSettings:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Repeats:
-    """How often a study runs, and the seed of its random numbers."""
-
-    runs: int = setting(20, "runs", low=1, high=100_000)
-    seed: int = setting(0, "seed of all random numbers", low=0)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
-
-
-@dataclass(frozen=True)
-class FilterEntry:
-    """A filter in a study: its name, its label in the tables, and the settings that differ from its defaults."""
-
-    filter: str
-    label: str = ""
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-    def build(self) -> Filter:
-        """Return the filter. Raises ConfigError when name or parameters are unknown."""
-        return FILTERS.build(self.filter, self.parameters, self.label)
-
-    def with_settings(self, stated: Mapping[str, Any]) -> FilterEntry:
-        """Return the filter with settings of the command line; None, and a setting that it lacks, are left out.
-
-        Raises:
-            ConfigError: an unknown filter, or a value that it does not permit.
-        """
-        known = {f.name for f in fields(FILTERS.get(self.filter))}  # type: ignore[arg-type]
-        own = {name: value for name, value in stated.items() if value is not None and name in known}
-        changed = replace(self, parameters={**self.parameters, **own})
-        changed.build()
-        return changed
-
-
-def filter_names() -> list[str]:
-    """Return the names of all filters, in the order of the tables."""
-    order = ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
-    return sorted(FILTERS.names(), key=lambda name: order.index(name) if name in order else len(order))
-
-
-FURTHER = ("title", "source", "note", "runs", "seed", "paper")
-"""Keys of a study's file besides the settings of its scenario and its filters."""
-
-
-def load_study(
-    path: Path | str | None, stated: Mapping[str, Any]
-) -> tuple[ScenarioSettings, list[FilterEntry], dict[str, Any]]:
-    """Return scenario, filters, and the remaining keys `runs`, `seed`, `title`, ... of a study's file.
+def load_study(path: Path | str | None, stated: Mapping[str, Any]) -> NavigationSettings:
+    """Return the settings of a study.
 
     Args:
         path: YAML file, the name of a shipped study, or None.
-        stated: settings of the scenario on the command line, which replace those of the file; None is not stated.
+        stated: settings on the command line, which replace those of the file; None is not stated.
     """
     files = shipped("studies")
     file = files[path] if isinstance(path, str) and path in files else path
     content = load_mapping(Path(file)) if file else {}
-    where = str(file) if file else "command line"
-    listed = content.pop("filters", [])
-    further = {key: content.pop(key) for key in FURTHER if key in content}
     content |= {key: value for key, value in stated.items() if value is not None}
-    settings = build(ScenarioSettings, content, where)
-    if not isinstance(listed, list):
-        raise ConfigError(f"{where}: filters: expected a list of filters with their parameters")
-    return settings, [_entry(item, f"{where}: filters[{n}]") for n, item in enumerate(listed, 1)], further
-
-
-def _entry(item: Any, where: str) -> FilterEntry:
-    """Return a filter as a file states it."""
-    if not isinstance(item, Mapping) or "filter" not in item:
-        raise ConfigError(f'{where}: expected a mapping with the key "filter"')
-    entry = build(FilterEntry, item, where)
-    FILTERS.build(entry.filter, entry.parameters, where)
-    return replace(entry, label=entry.label or entry.filter)
+    return build(NavigationSettings, content, str(file or "command line"))
 
 
 def grade_of(calibration: Calibration, grade: InsGrade, where: str) -> InsGrade:
@@ -205,22 +186,24 @@ class Navigation(Study):
     """Every filter with every grade of INS; one cell per pair.
 
     Attributes:
-        settings: map, voyage, gravimeter.
+        settings: of the study.
         entries: the filters.
         grades: of the INS: one, or without and with a calibration.
-        runs: of each cell; seed: of all of them.
     """
 
-    settings: ScenarioSettings
+    settings: NavigationSettings
     entries: tuple[FilterEntry, ...]
     grades: tuple[InsGrade, ...]
-    runs: int = 20
-    seed: int = 0
 
     @property
     def cells(self) -> int:
         """Filters times grades."""
         return len(self.entries) * len(self.grades)
+
+    @property
+    def runs(self) -> int:
+        """Runs of each cell."""
+        return self.settings.runs
 
     @property
     def block(self) -> int:
@@ -236,7 +219,7 @@ class Navigation(Study):
         """Return what identifies a cell."""
         entry, grade = self.part(cell)
         return {
-            "filter": entry.label,
+            "filter": entry.name,
             "mode": str(entry.parameters.get("mode", "default")),
             "accelerometer_ug": f"{grade.accelerometer:.6g}",
         }
@@ -245,10 +228,10 @@ class Navigation(Study):
         """Return the records of a task's runs."""
         runs = range(task.first, task.last)
         entry, grade = self.part(task.cell)
-        scenario = self.settings.scenario(grade, runs, self.seed)
+        scenario = self.settings.scenario(grade, runs)
         begin = time.perf_counter()
         with np.errstate(all="ignore"):  # a diverging filter overflows; its score says so
-            estimates = entry.build().run(scenario, Streams(self.seed, runs, Purpose.FILTER))
+            estimates = entry.build().run(scenario, Streams(self.settings.seed, runs, Purpose.FILTER))
             scores = score(scenario, estimates)
         seconds = (time.perf_counter() - begin) / len(runs)
         return [_record(task, i, scenario, estimates, scores, seconds) for i in range(len(runs))]
@@ -317,44 +300,19 @@ def axis_of(record: Record, axis: str) -> dict[int, float]:
     return {int(point[0]): point[at] for point in record.curve if math.isfinite(point[at])}
 
 
-class NavigationRow(NamedTuple):
-    """Statistics of one filter over its runs; errors over hours 3 to 8, in m.
+def statistics(study: Navigation, records: Sequence[Record]) -> list[Row]:
+    """Return one row per cell: errors over hours 3 to 8 in m, bound, lost runs, consistency, time.
 
-    Attributes:
-        filter, mode: what it is; accelerometer_ug: sigma of the bias of the INS, micro-g; runs: how many.
-        rmse_position_m, rmse_latitude_m, rmse_longitude_m: root mean square errors.
+    Definition:
+        rmse_position_m, rmse_latitude_m, rmse_longitude_m: root mean square errors; ins_m: of the INS alone.
         circular_95_m: radius that holds 95 % of the position errors.
         bound_m: root of the mean bound on the squared position error; bound_ratio: RMSE over it.
-        ins_m: RMSE of the INS alone.
-        lost, diverged: numbers of runs.
-        nees: mean normalised error squared; lookups: of the map, per run and epoch.
+        lost, diverged: numbers of runs; nees: mean normalised error squared; lookups: of the map, per run and epoch.
         seconds: time of all runs, s; epoch_us: of one run and epoch, microseconds.
     """
-
-    filter: str
-    mode: str
-    accelerometer_ug: float
-    runs: int
-    rmse_position_m: float
-    rmse_latitude_m: float
-    rmse_longitude_m: float
-    circular_95_m: float
-    bound_m: float
-    bound_ratio: float
-    ins_m: float
-    lost: int
-    diverged: int
-    nees: float
-    lookups: float
-    seconds: float
-    epoch_us: float
-
-
-def statistics(study: Navigation, records: Sequence[Record]) -> list[NavigationRow]:
-    """Return one row per cell: errors over hours 3 to 8, bound, lost runs, consistency, time."""
     bounds = []
     for grade in study.grades:
-        scenario = study.settings.scenario(grade, range(1), study.seed)
+        scenario = study.settings.scenario(grade, range(1))
         bounds.append(float(np.sqrt(bound(scenario)[counted(scenario)].sum(axis=1).mean())))
     return [
         _row(study, cell, records_of_cell(records, cell), bounds[cell // len(study.entries)])
@@ -362,7 +320,7 @@ def statistics(study: Navigation, records: Sequence[Record]) -> list[NavigationR
     ]
 
 
-def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) -> NavigationRow:
+def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) -> Row:
     """Return the statistics of one cell; least: its bound, m."""
     entry, grade = study.part(cell)
     north, east, ins, nees, lookups = (
@@ -371,25 +329,25 @@ def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) 
     )
     position = float(np.sqrt(north + east))
     seconds = sum(record.seconds for record in records)
-    return NavigationRow(
-        filter=entry.label,
-        mode=study.names(cell)["mode"],
-        accelerometer_ug=grade.accelerometer,
-        runs=len(records),
-        rmse_position_m=position,
-        rmse_latitude_m=float(np.sqrt(north)),
-        rmse_longitude_m=float(np.sqrt(east)),
-        circular_95_m=_circular_95(records),
-        bound_m=least,
-        bound_ratio=position / least,
-        ins_m=float(np.sqrt(ins)),
-        lost=sum(record.status != "kept" for record in records),
-        diverged=sum(record.status == "diverged" for record in records),
-        nees=nees,
-        lookups=lookups,
-        seconds=seconds,
-        epoch_us=1e6 * seconds / sum(record.iterations for record in records),
-    )
+    return {
+        "filter": entry.name,
+        "mode": study.names(cell)["mode"],
+        "accelerometer_ug": grade.accelerometer,
+        "runs": len(records),
+        "rmse_position_m": position,
+        "rmse_latitude_m": float(np.sqrt(north)),
+        "rmse_longitude_m": float(np.sqrt(east)),
+        "circular_95_m": _circular_95(records),
+        "bound_m": least,
+        "bound_ratio": position / least,
+        "ins_m": float(np.sqrt(ins)),
+        "lost": sum(record.status != "kept" for record in records),
+        "diverged": sum(record.status == "diverged" for record in records),
+        "nees": nees,
+        "lookups": lookups,
+        "seconds": seconds,
+        "epoch_us": 1e6 * seconds / sum(record.iterations for record in records),
+    }
 
 
 def _mean(values: Iterable[float | None]) -> float:
@@ -411,63 +369,42 @@ INS, BOUND = "INS alone", "bound"
 """Names of the curves that are not of a filter."""
 
 
-class CurvePoint(NamedTuple):
-    """RMSE at a time over all runs of a filter, of the INS alone or of the bound, and the track of run 0.
+def rmse_curves(study: Navigation, records: Sequence[Record]) -> list[tuple[Any, ...]]:
+    """Return RMSE against time of every filter, then of the INS alone and the bound for each grade of INS.
 
-    Attributes:
-        filter, mode, accelerometer_ug: which filter, and of which INS; seconds: since the start of the voyage.
-        rmse_latitude_m, rmse_longitude_m, rmse_position_m: None where unknown, m.
-        latitude, longitude: corrected position of run 0, or that of its INS alone, degrees; sigma_m: claimed, m.
+    A row holds filter, mode, micro-g, seconds; RMSE of latitude, longitude and position, m; latitude and longitude of
+    run 0, corrected or of the INS alone, degrees, and its claimed sigma, m. None is unknown.
     """
-
-    filter: str
-    mode: str
-    accelerometer_ug: float
-    seconds: int
-    rmse_latitude_m: float | None
-    rmse_longitude_m: float | None
-    rmse_position_m: float | None
-    latitude: float | None = None
-    longitude: float | None = None
-    sigma_m: float | None = None
-
-
-def rmse_curves(study: Navigation, records: Sequence[Record]) -> list[CurvePoint]:
-    """Return RMSE against time of every filter, then of the INS alone and the bound for each grade of INS."""
-    points = []
+    rows: list[tuple[Any, ...]] = []
     for cell in range(study.cells):
         names, own = study.names(cell), records_of_cell(records, cell)
         first = {axis: axis_of(own[0], axis) for axis in AXES}
         north, east = (_mean_squares(own, axis) for axis in ("north", "east"))
-        points += [
-            CurvePoint(
-                *(names["filter"], names["mode"], float(names["accelerometer_ug"]), second),
-                *_roots(north.get(second), east.get(second)),
-                *(first["latitude"].get(second), first["longitude"].get(second), sigma),
-            )
-            for second, sigma in first["sigma"].items()
-        ]
+        for second, sigma in first["sigma"].items():
+            place = first["latitude"].get(second), first["longitude"].get(second)
+            rmse = _roots(north.get(second), east.get(second))
+            label = names["filter"], names["mode"], float(names["accelerometer_ug"])
+            rows.append((*label, second, *rmse, *place, sigma))
     for grade in study.grades:
-        points += _limits(study, grade)
-    return points
+        rows += _limits(study, grade)
+    return rows
 
 
-def _limits(study: Navigation, grade: InsGrade) -> list[CurvePoint]:
-    """Return the curves of the INS alone, over the study's runs, and of the bound."""
-    scenario = study.settings.scenario(grade, range(study.runs), study.seed)
+def _limits(study: Navigation, grade: InsGrade) -> list[tuple[Any, ...]]:
+    """Return the rows of the INS alone, over the study's runs, and of the bound."""
+    scenario = study.settings.scenario(grade, range(study.runs))
     at = slice(None, None, _stride(scenario))
     indicated = np.degrees([scenario.ins.latitude[0, at], scenario.ins.longitude[0, at]]).T
-    alone: Sequence[tuple[float | None, ...]] | Float = [(None, None)] * len(indicated)
+    alone: Any = [(None, None)] * len(indicated)
     if scenario.error is not None:
         alone = np.square(scenario.error[:, at]).mean(axis=0)
-    ug = float(f"{grade.accelerometer:.6g}")
-    seconds = [round(second) for second in scenario.seconds[at]]
-    ins = [
-        CurvePoint(INS, "", ug, second, *_roots(*squares), *place)
-        for second, squares, place in zip(seconds, alone, indicated, strict=True)
-    ]
-    least = zip(seconds, bound(scenario)[at], strict=True)
-    return ins + [CurvePoint(BOUND, "", ug, second, *_roots(*squares)) for second, squares in least]
+    rows: list[tuple[Any, ...]] = []
+    for name, squares in ((INS, alone), (BOUND, bound(scenario)[at])):
+        for k, second in enumerate(scenario.seconds[at]):
+            place = indicated[k] if name == INS else (None, None)
+            label = name, "", float(f"{grade.accelerometer:.6g}")
+            rows.append((*label, round(second), *_roots(*squares[k]), *place, None))
+    return rows
 
 
 def _mean_squares(records: Sequence[Record], axis: str) -> dict[int, float]:

@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,16 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.minimize import Status, Stopping, minimize
 from accelcal_cli.studies.functions import TestFunction
-from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of, records_of_cell
+from accelcal_cli.studies.study import (
+    Entry,
+    Record,
+    Row,
+    Study,
+    Task,
+    median_curve,
+    records_of,
+    records_of_cell,
+)
 
 NEEDS = {"residuals": "residuals (a sum of squares)", "closed_form": "a closed form"}
 
@@ -122,56 +130,35 @@ def _listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
-class BenchmarkRow(NamedTuple):
-    """Statistics of one optimizer on one function over its runs.
+def statistics(study: Benchmark, records: Sequence[Record]) -> list[Row]:
+    """Return one row per cell: statistics of the cost over the runs, success rate, evaluations, seconds.
 
-    Attributes:
-        function, optimizer: name and label; runs: how many; evaluations: median.
+    Definition:
+        evaluations, seconds: medians; evaluations_to_tolerance: median of the runs that reached the tolerance.
         min, max, mean, variance, median: of the cost; a run without any finite cost counts as infinite.
-        success_rate: part of the runs that reached the tolerance; evaluations_to_tolerance: their median.
-        failures: runs with a numerical failure; seconds: median time of a run.
+        failures: number of runs with a numerical failure.
     """
-
-    function: str
-    optimizer: str
-    runs: int
-    evaluations: int
-    min: float
-    max: float
-    mean: float
-    variance: float | None
-    median: float
-    success_rate: float
-    evaluations_to_tolerance: int | None
-    failures: int
-    seconds: float
-
-
-def statistics(study: Benchmark, records: Sequence[Record]) -> list[BenchmarkRow]:
-    """Return one row per cell: statistics of the cost over the runs, success rate, evaluations, seconds."""
     by_cell = [(study.names(cell), records_of_cell(records, cell)) for cell in range(study.cells)]
-    return [_row(own, **names) for names, own in by_cell if own]
+    return [{**names, **_statistics(own)} for names, own in by_cell if own]
 
 
-def _row(records: Sequence[Record], function: str, optimizer: str) -> BenchmarkRow:
+def _statistics(records: Sequence[Record]) -> Row:
     cost = np.array([r.cost for r in records])
     hits = [r.hit for r in records if r.hit is not None]
     several = len(cost) > 1 and bool(np.isfinite(cost).all())
-    return BenchmarkRow(
-        function,
-        optimizer,
-        runs=len(records),
-        evaluations=int(np.median([r.evaluations for r in records])),
-        min=float(cost.min()),
-        max=float(cost.max()),
-        mean=float(cost.mean()),
-        variance=float(cost.var(ddof=1)) if several else None,
-        median=float(np.median(cost)),
-        success_rate=len(hits) / len(records),
-        evaluations_to_tolerance=int(np.median(hits)) if hits else None,
-        failures=sum(r.status == Status.FAILED.name.lower() for r in records),
-        seconds=float(np.median([r.seconds for r in records])),
-    )
+    return {
+        "runs": len(records),
+        "evaluations": int(np.median([r.evaluations for r in records])),
+        "min": float(cost.min()),
+        "max": float(cost.max()),
+        "mean": float(cost.mean()),
+        "variance": float(cost.var(ddof=1)) if several else None,
+        "median": float(np.median(cost)),
+        "success_rate": len(hits) / len(records),
+        "evaluations_to_tolerance": int(np.median(hits)) if hits else None,
+        "failures": sum(r.status == Status.FAILED.name.lower() for r in records),
+        "seconds": float(np.median([r.seconds for r in records])),
+    }
 
 
 def curves(study: Benchmark, records: Sequence[Record]) -> Mapping[str, Mapping[str, tuple[Float, Float]]]:
@@ -215,7 +202,7 @@ def rank(study: Benchmark, records: Sequence[Record]) -> Ranking | None:
     labels = [e.label for e in study.entries if all(label != e.label for _, label in study.unsuited)]
     if len(labels) < 2 or len(study.functions) < 2:
         return None
-    medians = {(row.function, row.optimizer): row.median for row in statistics(study, records)}
+    medians = {(r["function"], r["optimizer"]): r["median"] for r in statistics(study, records)}
     return ranking(labels, np.array([[medians[f, label] for label in labels] for f in study.functions]))
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +29,16 @@ from accelcal_cli.studies.scenarios import (
     parameter_errors,
     success_limit,
 )
-from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of, records_of_cell
+from accelcal_cli.studies.study import (
+    Entry,
+    Record,
+    Row,
+    Study,
+    Task,
+    median_curve,
+    records_of,
+    records_of_cell,
+)
 
 
 @dataclass(frozen=True)
@@ -137,34 +145,12 @@ ROUNDING = 1e-12
 """An excess of the cost below this part is rounding."""
 
 
-class ComparisonRow(NamedTuple):
-    """Statistics of one optimizer over its runs.
-
-    Attributes:
-        optimizer: label; runs: how many; success_rate: part of the runs that reached the least cost.
-        seconds, evaluations, cost: medians, s and (m/s^2)^4; evaluations_to_success: median of the successful runs.
-        excess: median part by which the cost is above the least cost; None without noise.
-        bias_error, scale_error, misalignment_error, efficiency: rms, see `parameter_errors`.
-    """
-
-    optimizer: str
-    runs: int
-    success_rate: float
-    seconds: float | None
-    evaluations: int | None
-    evaluations_to_success: int | None
-    cost: float | None
-    excess: float | None
-    bias_error: float | None
-    scale_error: float | None
-    misalignment_error: float | None
-    efficiency: float | None
-
-
-def statistics(
-    study: Comparison, records: Sequence[Record], only_successful: bool = False
-) -> list[ComparisonRow]:
+def statistics(study: Comparison, records: Sequence[Record], only_successful: bool = False) -> list[Row]:
     """Return one row per optimizer: success rate, medians of time, evaluations and cost, rms errors over the runs.
+
+    Definition:
+        excess: part by which the cost is above the least cost; None without noise.
+        bias_error, scale_error, misalignment_error, efficiency: see `parameter_errors`.
 
     Args:
         study: the comparison; records: of its runs.
@@ -172,7 +158,9 @@ def statistics(
     """
     records = with_least_cost(study, records)
     by_label = [(entry.label, records_of_cell(records, cell)) for cell, entry in enumerate(study.entries)]
-    return [_row(study, label, own, only_successful) for label, own in by_label if own]
+    return [
+        {"optimizer": label, **_statistics(study, own, only_successful)} for label, own in by_label if own
+    ]
 
 
 def with_least_cost(study: Comparison, records: Sequence[Record]) -> list[Record]:
@@ -199,22 +187,21 @@ def succeeded(study: Comparison, record: Record) -> bool:
     return least is not None and record.cost <= float(success_limit(np.array(least), study.tolerance))
 
 
-def _row(study: Comparison, label: str, own: Sequence[Record], only_successful: bool) -> ComparisonRow:
+def _statistics(study: Comparison, own: Sequence[Record], only_successful: bool) -> Row:
     good = [r for r in own if succeeded(study, r)]
     hits = [r.hit for r in good if r.hit is not None]
     counted = good if only_successful else own
     evaluations = [r.evaluations for r in counted]
-    return ComparisonRow(
-        label,
-        runs=len(own),
-        success_rate=len(good) / len(own),
-        seconds=_median([r.seconds for r in counted]),
-        evaluations=int(np.median(evaluations)) if evaluations else None,
-        evaluations_to_success=int(np.median(hits)) if hits else None,
-        cost=_median([r.cost for r in counted]),
-        excess=_median([_excess(r) for r in counted]) if study.noisy else None,
+    return {
+        "runs": len(own),
+        "success_rate": len(good) / len(own),
+        "seconds": _median([r.seconds for r in counted]),
+        "evaluations": int(np.median(evaluations)) if evaluations else None,
+        "evaluations_to_success": int(np.median(hits)) if hits else None,
+        "cost": _median([r.cost for r in counted]),
+        "excess": _median([_excess(r) for r in counted]) if study.noisy else None,
         **{name: _total(counted, name) for name in (*ERRORS, "efficiency")},
-    )
+    }
 
 
 def _excess(record: Record) -> float:
@@ -272,40 +259,27 @@ def estimates(study: Comparison, records: Sequence[Record], printed: Sequence[Pr
     return named
 
 
-class ErrorParts(NamedTuple):
-    """Parts of the error of an estimate, rms in output units, and its cost on the readings, (m/s^2)^4.
+def error_parts(study: Comparison, named: Estimates) -> list[Row]:
+    """Return the parts of the error of each estimate against the one called `truth`, rms in output units.
 
-    Attributes:
+    Definition:
         rotation: the antisymmetric part of the off-diagonals.
         misalignments, scale_factors: in gauge `lower`.
+        cost: on the readings of run 0. Units: (m/s^2)^4.
     """
-
-    estimate: str
-    off_diagonals: float
-    rotation: float
-    misalignments: float
-    scale_factors: float
-    bias: float
-    cost: float
-
-
-def error_parts(study: Comparison, named: Estimates) -> list[ErrorParts]:
-    """Return the parts of the error of each estimate against the one called `truth`."""
     true_K, true_D = named["truth"]
     problem = study.calibrations(range(1)).problem
-    rows = []
+    rows: list[Row] = []
     for name, (K, D) in named.items():
         above, below = (K - true_K)[ABOVE], (K - true_K)[BELOW]
         lower = to_gauge(K, "lower") - to_gauge(true_K, "lower")
-        rows.append(
-            ErrorParts(
-                name,
-                off_diagonals=_rms(np.concatenate([above, below])),
-                rotation=_rms(0.5 * (above - below)),
-                misalignments=_rms(lower[BELOW]),
-                scale_factors=_rms(np.diagonal(lower)),
-                bias=_rms(D - true_D),
-                cost=float(problem.cost(problem.coordinates(K[None], D[None])[:, None])[0, 0]),
-            )
-        )
+        row = {
+            "off_diagonals": _rms(np.concatenate([above, below])),
+            "rotation": _rms(0.5 * (above - below)),
+            "misalignments": _rms(lower[BELOW]),
+            "scale_factors": _rms(np.diagonal(lower)),
+            "bias": _rms(D - true_D),
+            "cost": float(problem.cost(problem.coordinates(K[None], D[None])[:, None])[0, 0]),
+        }
+        rows.append({"estimate": name, **row})
     return rows

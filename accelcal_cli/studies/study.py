@@ -28,6 +28,9 @@ from accelcal_cli.schema import build
 
 ALL = "all"
 
+Row = Mapping[str, Any]
+"""A row of statistics: names and numbers by the key of their column."""
+
 TRACE_POINTS = 100
 """Points of a record's convergence curve."""
 
@@ -44,9 +47,9 @@ class Entry:
         optimizer: its name; parameters: settings that differ from its defaults.
     """
 
-    label: str
-    optimizer: str
-    parameters: dict[str, Any]
+    label: str = ""
+    optimizer: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
 
     def build(self) -> Optimizer:
         """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
@@ -128,16 +131,6 @@ def _shipped(name: str, labels: Iterable[str]) -> Entry:
     return Entry(name, name, shipped_parameters(name))
 
 
-@dataclass(frozen=True)
-class _FileEntry:
-    """One optimizer as a file states it."""
-
-    optimizer: str
-    label: str = ""
-    parameters: dict[str, Any] = field(default_factory=dict)
-    source: str = ""
-
-
 def load_entries(path: Path) -> dict[str, Entry]:
     """Return the optimizers of a file by label.
 
@@ -164,13 +157,13 @@ def load_entries(path: Path) -> dict[str, Entry]:
 def _entry(item: Any, where: str) -> Entry:
     if not isinstance(item, Mapping) or "optimizer" not in item:
         raise ConfigError(f'{where}: expected a mapping with the key "optimizer"')
-    stated = build(_FileEntry, item, where)
-    label = stated.label or stated.optimizer
+    entry = build(Entry, {key: value for key, value in item.items() if key != "source"}, where)
+    label = entry.label or entry.optimizer
     if "," in label or label == ALL:
         raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')
-    parameters = {**shipped_parameters(stated.optimizer), **stated.parameters}
-    OPTIMIZERS.build(stated.optimizer, parameters, where)
-    return Entry(label, stated.optimizer, parameters)
+    parameters = {**shipped_parameters(entry.optimizer), **entry.parameters}
+    OPTIMIZERS.build(entry.optimizer, parameters, where)
+    return Entry(label, entry.optimizer, parameters)
 
 
 @dataclass(frozen=True)

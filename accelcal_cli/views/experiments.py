@@ -8,12 +8,12 @@ from typing import Any
 
 from accelcal_cli.studies import compare, reproduce
 from accelcal_cli.studies.benchmark import Benchmark
-from accelcal_cli.studies.compare import Comparison, ComparisonRow, Estimates
+from accelcal_cli.studies.compare import Comparison, Estimates
 from accelcal_cli.studies.reproduce import Curves, Experiment, PaperTable, Part
 from accelcal_cli.studies.scenarios import WITHIN, Recording
-from accelcal_cli.studies.study import Record
+from accelcal_cli.studies.study import Record, Row
 from accelcal_cli.table import Column, Table
-from accelcal_cli.views.studies import benchmark_table
+from accelcal_cli.views.studies import benchmark_table, table_of
 
 COMPARISON = (
     Column("optimizer"),
@@ -29,7 +29,6 @@ COMPARISON = (
     Column("misalignment", "arcsec", ".3g", key="misalignment_error"),
     Column("efficiency", format=".3g"),
 )
-"""Of `ComparisonRow`, in its order."""
 
 ERROR_PARTS = (
     Column("estimate"),
@@ -40,7 +39,6 @@ ERROR_PARTS = (
     Column("bias", format=".2g"),
     Column("cost", "(m/s^2)^4", ".2g"),
 )
-"""Of `ErrorParts`, in its order."""
 
 ERROR_PARTS_NOTE = (
     "Errors, rms in output units. Rotation: the antisymmetric part of the off-diagonals, which no readings without "
@@ -71,8 +69,8 @@ def comparison_conditions(study: Comparison) -> str:
 
 def comparison_table(study: Comparison, records: Sequence[Record]) -> Table:
     """Return one row per optimizer, with notes on what success is and who missed it."""
-    rows = tuple(compare.statistics(study, records))
-    return Table("Comparison", COMPARISON, rows, (*_notes(study), *_misses(rows)))
+    rows = compare.statistics(study, records)
+    return table_of("Comparison", COMPARISON, rows, (*_notes(study), *_misses(rows)))
 
 
 def _notes(study: Comparison) -> tuple[str, ...]:
@@ -84,14 +82,17 @@ def _notes(study: Comparison) -> tuple[str, ...]:
     return (success,)
 
 
-def _misses(rows: Sequence[ComparisonRow]) -> list[str]:
+def _misses(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each optimizer that did not always reach the least cost of noisy readings."""
-    return [
-        f"{row.optimizer} came within 1 % of the least cost in {row.success_rate:.0%} of its runs; its median run is "
-        f"{'within 1 %' if row.excess <= WITHIN else f'{1.0 + row.excess:.3g} times as high'}."
-        for row in rows
-        if row.excess is not None and row.success_rate < 1.0
-    ]
+    sentences = []
+    for row in rows:
+        excess, rate = row["excess"], row["success_rate"]
+        if excess is not None and rate < 1.0:
+            cost = "within 1 %" if excess <= WITHIN else f"{1.0 + excess:.3g} times as high"
+            sentences.append(
+                f"{row['optimizer']} came within 1 % of the least cost in {rate:.0%} of its runs; its median run is {cost}."
+            )
+    return sentences
 
 
 def parameter_table(estimates: Estimates) -> Table:
@@ -106,8 +107,8 @@ def parameter_table(estimates: Estimates) -> Table:
 
 def error_parts_table(study: Comparison, estimates: Estimates) -> Table:
     """Return the parts of the error of each estimate, and its cost on the readings."""
-    rows = tuple(compare.error_parts(study, estimates))
-    return Table("what of the error the readings show", ERROR_PARTS, rows, (ERROR_PARTS_NOTE,))
+    rows = compare.error_parts(study, estimates)
+    return table_of("what of the error the readings show", ERROR_PARTS, rows, [ERROR_PARTS_NOTE])
 
 
 def catalogue_table() -> Table:
@@ -142,7 +143,7 @@ def _part_tables(part: Part, records: Sequence[Record]) -> list[Table]:
             tables.append(checkpoint_table(reproduce.curves_of(study, records)))
         elif show == "successful" and isinstance(study, Comparison):
             rows = compare.statistics(study, records, only_successful=True)
-            tables.append(Table("successful runs alone", COMPARISON, tuple(rows)))
+            tables.append(table_of("successful runs alone", COMPARISON, rows))
         elif show == "parameters" and isinstance(study, Comparison):
             estimates = compare.estimates(study, records, part.printed)
             tables += [parameter_table(estimates), error_parts_table(study, estimates)]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.navigation.study import Navigation, NavigationRow, axis_of, rmse_curves, statistics
-from accelcal_cli.studies.study import Record, records_of_cell
+from accelcal_cli.navigation.study import Navigation, NavigationSettings, axis_of, rmse_curves, statistics
+from accelcal_cli.studies.study import Record, Row, records_of_cell
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.studies import table_of
 
 COLUMNS = (
     Column("filter"),
@@ -32,7 +32,6 @@ COLUMNS = (
     Column("time", "s", ".1f", key="seconds"),
     Column("epoch", "us", ".0f", key="epoch_us"),
 )
-"""Of `NavigationRow`, in its order."""
 
 CURVES = (
     Column("filter"),
@@ -46,34 +45,34 @@ CURVES = (
     Column("longitude", "deg", ".6f"),
     Column("sigma_m", "m", ".1f"),
 )
-"""Of `CurvePoint`, in its order."""
 
 
 def summary(study: Navigation, records: Sequence[Record]) -> Table:
     """Return one row per filter: errors over hours 3 to 8, bound, lost runs, consistency, time."""
-    rows = tuple(statistics(study, records))
-    return Table("Navigation", COLUMNS, rows, tuple(_note(study, row) for row in rows if row.lost))
+    rows = statistics(study, records)
+    return table_of("Navigation", COLUMNS, rows, [_note(study, row) for row in rows if row["lost"]])
 
 
-def _note(study: Navigation, row: NavigationRow) -> str:
+def _note(study: Navigation, row: Row) -> str:
     """Return what to say of lost and diverged runs, which count separately here."""
-    ins = f", {row.accelerometer_ug:.3g} micro-g" if len(study.grades) > 1 else ""
-    runs = f"{row.runs} run{'s' * (row.runs != 1)}"
+    ins = f", {row['accelerometer_ug']:.3g} micro-g" if len(study.grades) > 1 else ""
+    runs = f"{row['runs']} run{'s' * (row['runs'] != 1)}"
     return (
-        f"{row.filter} ({row.mode}{ins}): of {runs} {row.diverged} diverged and {row.lost - row.diverged} lost "
-        "lock; their errors are included in the row."
+        f"{row['filter']} ({row['mode']}{ins}): of {runs} {row['diverged']} diverged and "
+        f"{row['lost'] - row['diverged']} lost lock; their errors are included in the row."
     )
 
 
-def with_paper(table: Table, further: Mapping[str, Any]) -> Table:
+def with_paper(table: Table, settings: NavigationSettings) -> Table:
     """Return a summary with the paper's RMSE of the position next to ours, and the title and note of the study."""
-    paper = {str(name).lower(): value for name, value in (further.get("paper") or {}).items()}
+    paper = {str(name).lower(): value for name, value in settings.paper.items()}
     at = [column.key for column in table.columns].index("rmse_position_m") + 1
     rows = [(*row[:at], paper.get(str(row[0]).lower()), *row[at:]) for row in table.rows]
     column = Column("paper", "m", ".1f", key="paper_m")
-    notes = tuple(filter(None, (*table.notes, further.get("note"))))
-    title = str(further.get("title", table.title))
-    return Table(title, (*table.columns[:at], column, *table.columns[at:]), tuple(rows), notes)
+    notes = tuple(filter(None, (*table.notes, settings.note)))
+    return Table(
+        settings.title or table.title, (*table.columns[:at], column, *table.columns[at:]), tuple(rows), notes
+    )
 
 
 def curves(study: Navigation, records: Sequence[Record]) -> Table:
@@ -102,7 +101,7 @@ class Chart:
 
 def chart_of(study: Navigation, records: Sequence[Record], curves: Table) -> Chart:
     """Return the picture of a study that was run."""
-    scenario = study.settings.scenario(study.grades[0], range(1), study.seed)
+    scenario = study.settings.scenario(study.grades[0], range(1))
     grid, true, ins = scenario.gravity_map, scenario.true, scenario.ins
     tracks = {}
     for cell in range(study.cells):

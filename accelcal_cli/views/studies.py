@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from accelcal_cli.studies.benchmark import LEVEL, Benchmark, Ranking, statistics
-from accelcal_cli.studies.study import Record, Study
+from accelcal_cli.studies.study import Record, Row, Study
 from accelcal_cli.table import Column, Table
 
 FEW = 5
 """Below this many functions the chi-squared distribution is a coarse approximation and the power is small."""
+
+
+def table_of(title: str, columns: Sequence[Column], rows: Iterable[Row], notes: Iterable[str] = ()) -> Table:
+    """Return a table of rows of statistics, each cell found by the key of its column."""
+    keys = [column.key or column.name for column in columns]
+    return Table(title, tuple(columns), tuple([row[key] for key in keys] for row in rows), tuple(notes))
 
 
 def raw_table(study: Study, records: Sequence[Record]) -> Table:
@@ -54,7 +60,6 @@ BENCHMARK = (
     Column("failed", format="d", key="failures"),
     Column("time", "s", ".3f", key="seconds"),
 )
-"""Of `BenchmarkRow`, in its order."""
 
 
 def benchmark_title(study: Benchmark) -> str:
@@ -66,7 +71,7 @@ def benchmark_title(study: Benchmark) -> str:
 
 def benchmark_table(study: Benchmark, records: Sequence[Record]) -> Table:
     """Return one row per cell: statistics of the cost over the runs, success rate, evaluations, seconds."""
-    return Table("Benchmark", BENCHMARK, tuple(statistics(study, records)))
+    return table_of("Benchmark", BENCHMARK, statistics(study, records))
 
 
 def ranking_table(ranking: Ranking) -> Table:
