@@ -14,7 +14,7 @@ import yaml
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.schema import build
+from accelcal_cli.schema import from_mapping
 
 if TYPE_CHECKING:
     from accelcal_cli.sensor.simulation import Sensor
@@ -148,7 +148,7 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
     if stated.get("optimizer", name) != name:
         own = {}  # the file's parameters belong to the optimizer that the command line replaced
     parameters = {**shipped_parameters(name), **own, **overrides.get("parameters", {})}
-    settings = build(Settings, {**merged, "parameters": parameters}, where)
+    settings = from_mapping(Settings, {**merged, "parameters": parameters}, where)
     settings.build_optimizer()
     return settings
 
@@ -177,4 +177,4 @@ def load_sensor(name: str) -> Sensor:
             f'unknown sensor "{name}"{did_you_mean(name, files)}; known: {", ".join(files)}, or the path of a '
             "YAML file"
         )
-    return build(Sensor, load_mapping(path), str(path))
+    return from_mapping(Sensor, load_mapping(path), str(path))

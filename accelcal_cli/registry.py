@@ -69,4 +69,4 @@ class Registry(Generic[T]):
 
     def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
         """Build the class called `name` from `mapping`; see `build`."""
-        return schema.build(self.get(name), mapping, where)
+        return schema.from_mapping(self.get(name), mapping, where)

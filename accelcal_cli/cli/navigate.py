@@ -132,13 +132,13 @@ def _study(
 ) -> Navigation:
     """Return the study that file and command line state together."""
     from accelcal_cli.navigation.study import Navigation, Repeats, load_waters
-    from accelcal_cli.schema import build
+    from accelcal_cli.schema import from_mapping
     from accelcal_cli.studies.entries import words
 
     waters, own, further = load_waters(config, stated)
     filed: dict[str, Any] = {key: further[key] for key in ("runs", "seed") if key in further}
     said = {key: value for key, value in (("runs", runs), ("seed", seed)) if value is not None}
-    repeats = build(Repeats, {**filed, **said}, str(config or "command line"))
+    repeats = from_mapping(Repeats, {**filed, **said}, str(config or "command line"))
     entries = _entries(words(names), own, mode, settings)
     grades: tuple[Grade, ...] = (waters.ins,)
     if calibration is not None:

@@ -27,7 +27,7 @@ from accelcal_cli.navigation.scenario import Scenario, check_coverage, read_voya
 from accelcal_cli.navigation.scores import Scores, score
 from accelcal_cli.navigation.voyage import Plan, planned
 from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.schema import build, check, setting
+from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.studies.study import Record, Study, Task
 
@@ -302,7 +302,7 @@ def load_waters(
     where = str(file) if file else "command line"
     listed = content.pop("filters", [])
     further = {key: content.pop(key) for key in FURTHER if key in content}
-    waters = build(Waters, {**content, **{k: v for k, v in stated.items() if v is not None}}, where)
+    waters = from_mapping(Waters, {**content, **{k: v for k, v in stated.items() if v is not None}}, where)
     if not isinstance(listed, list):
         raise ConfigError(f"{where}: filters: expected a list of filters with their parameters")
     entries = [_entry(item, f"{where}: filters[{n}]") for n, item in enumerate(listed, 1)]
@@ -323,7 +323,7 @@ class _Stated:
 def _entry(item: Any, where: str) -> FilterEntry:
     if not isinstance(item, Mapping) or "filter" not in item:
         raise ConfigError(f'{where}: expected a mapping with the key "filter"')
-    stated = build(_Stated, item, where)
+    stated = from_mapping(_Stated, item, where)
     FILTERS.build(stated.filter, stated.parameters, where)
     return FilterEntry(stated.label or stated.filter, stated.filter, stated.parameters)
 

@@ -11,7 +11,7 @@ from typing import Any
 from accelcal_cli.config import load_mapping, shipped_parameters
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.schema import build
+from accelcal_cli.schema import from_mapping
 from accelcal_cli.studies.study import Entry
 
 ALL = "all"
@@ -104,7 +104,7 @@ def load_entries(path: Path) -> dict[str, Entry]:
 def _entry(item: Any, where: str) -> Entry:
     if not isinstance(item, Mapping) or "optimizer" not in item:
         raise ConfigError(f'{where}: expected a mapping with the key "optimizer"')
-    stated = build(_Stated, item, where)
+    stated = from_mapping(_Stated, item, where)
     label = stated.label or stated.optimizer
     if "," in label or label == ALL:
         raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')

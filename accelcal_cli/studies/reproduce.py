@@ -14,7 +14,7 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.schema import build
+from accelcal_cli.schema import from_mapping
 from accelcal_cli.studies import benchmark, compare
 from accelcal_cli.studies import compare as outcome
 from accelcal_cli.studies.benchmark import Benchmark
@@ -65,7 +65,7 @@ def load(name: str) -> Experiment:
         raise ConfigError(f'unknown study "{name}"{did_you_mean(name, files)}; known: {", ".join(files)}')
     content = load_mapping(files[name])
     content["parts"] = [_with_sensor(part) for part in content.get("parts", [])]
-    return replace(build(Experiment, content, str(files[name])), name=name)
+    return replace(from_mapping(Experiment, content, str(files[name])), name=name)
 
 
 def _with_sensor(part: dict[str, Any]) -> dict[str, Any]:
