@@ -7,9 +7,11 @@ new field is one line, its docstring, and `older` for the files that were writte
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from accelcal_cli.calibration.observability import (
     Verdict,
 )
 from accelcal_cli.calibration.settings import LARGEST
+from accelcal_cli.config import parse_mapping, read_text
 from accelcal_cli.errors import ConfigError, DataError, UsageError
 from accelcal_cli.schema import Limits, array, from_mapping, to_mapping
 from accelcal_cli.sensor.model import ErrorModel, Gauge
@@ -278,3 +281,27 @@ class Calibration:
         if np.abs(result.K_a).max() < 1 / LARGEST or np.linalg.matrix_rank(result.K_a) < 3:
             raise DataError(f"{place}: K_a: is singular; expected an invertible matrix")
         return result
+
+
+def load_result(path: str | Path, stdin: BinaryIO | None = None) -> Calibration:
+    """Return the calibration of a result file, JSON or YAML whatever its name says; of `stdin` where it is given.
+
+    Raises:
+        ConfigError: unreadable, or neither JSON nor YAML.
+        DataError: not the record of a calibration; the message names the key.
+    """
+    text = read_text(Path(path), stdin)
+    try:
+        record = parse_mapping(text, str(path))
+    except ConfigError as error:
+        raise ConfigError(f"{error}; the result file of a calibration was expected") from None
+    return Calibration.from_record(record, str(path))
+
+
+RECORD_HEAD = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s|#[^\n]*\n|---\s)*(?:\{|['\"]?(?:K_a|D_a|schema)['\"]?:)")
+"""How the record of a calibration begins, as JSON or YAML in our order of keys or sorted; no table of readings does."""
+
+
+def is_result(head: bytes) -> bool:
+    """Return whether a file that begins so is a result file rather than readings."""
+    return RECORD_HEAD.match(head) is not None

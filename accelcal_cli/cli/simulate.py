@@ -67,14 +67,14 @@ def command(
     --sensors they carry the label of their sensor, and `fleet` calibrates each. With --raw they are a log of time,
     acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
-    from accelcal_cli.config import dump, load_sensor
+    from accelcal_cli.config import dump
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.output.machine import write_log
     from accelcal_cli.rng import Purpose, Streams
     from accelcal_cli.schema import from_mapping
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import Handling, handled, simulate, simulate_fleet
+    from accelcal_cli.sensor.simulation import Handling, handled, load_sensor, simulate, simulate_fleet
 
     if noise is not None and not 0 <= noise <= LARGEST_NOISE:
         raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from simulated import DPSO
 
-from accelcal_cli.config import load_mapping, load_sensor, shipped
+from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.schema import from_mapping
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.simulation import Sensor, Spread, simulate
+from accelcal_cli.sensor.simulation import Sensor, Spread, load_sensor, simulate
 
 G = 9.8
 SENSOR = Sensor(name="s", K_a=tuple(map(tuple, DPSO.K)), D_a=tuple(DPSO.D))
