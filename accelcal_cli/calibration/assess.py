@@ -158,7 +158,7 @@ class Judgement:
         at_wall: the search stopped at a wall of its box: what it found is not the least-squares answer.
     """
 
-    verdict: str
+    verdict: Verdict
     reasons: tuple[str, ...]
     suggestions: tuple[str, ...]
     information: Float

@@ -19,7 +19,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.assess import final_verdict, large_residuals, not_fitting
 from accelcal_cli.calibration.box import nominal_before
 from accelcal_cli.calibration.fit import KEPT, KEPT_WORST, OUTLIER_LEVEL, room_of
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, UNDETERMINED, WEAK, verdict_of
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, UNDETERMINED, WEAK, Verdict, verdict_of
 from accelcal_cli.calibration.problem import ROWS_COLUMNS
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.settings import Settings
@@ -243,7 +243,7 @@ def _nine(model: ErrorModel) -> Float:
     return np.array(columns).T
 
 
-def _verdict(dop: Float, freedom: int) -> str:
+def _verdict(dop: Float, freedom: int) -> Verdict:
     return final_verdict(verdict_of(float(dop.max()), 9), edge=False, freedom=freedom)
 
 

@@ -153,8 +153,8 @@ def _simulated(
     fixed: bool,
     columns: str | None,
 ) -> Simulation:
-    from accelcal_cli.config import load_sensor
     from accelcal_cli.sensor.poses import directions
+    from accelcal_cli.sensor.simulation import load_sensor
     from accelcal_cli.studies.scenarios import FEWEST, Simulation
 
     if columns is not None:

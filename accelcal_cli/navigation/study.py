@@ -25,7 +25,7 @@ from accelcal_cli.navigation.scenario import Scenario, check_coverage, from_reco
 from accelcal_cli.navigation.scores import SETTLED, Scores, bound, counted, score
 from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR, PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.schema import build, check, setting
+from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.studies.study import Record, Row, Study, Task, records_of_cell
 
@@ -157,7 +157,7 @@ def load_study(path: Path | str | None, stated: Mapping[str, Any]) -> Navigation
     file = files[path] if isinstance(path, str) and path in files else path
     content = load_mapping(Path(file)) if file else {}
     content |= {key: value for key, value in stated.items() if value is not None}
-    return build(NavigationSettings, content, str(file or "command line"))
+    return from_mapping(NavigationSettings, content, str(file or "command line"))
 
 
 def grade_of(calibration: Calibration, grade: InsGrade, where: str) -> InsGrade:

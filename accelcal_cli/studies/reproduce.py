@@ -11,7 +11,7 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.schema import build
+from accelcal_cli.schema import from_mapping
 from accelcal_cli.studies import benchmark, compare
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison, PrintedEstimate
@@ -203,7 +203,7 @@ def load(name: str) -> Experiment:
     for part in content.get("parts", []):
         if simulation := part.get("simulation"):  # by the name of a sensor, whose file takes its place
             simulation["sensor"] = load_mapping(shipped("sensors")[simulation["sensor"]])
-    return replace(build(Experiment, content, str(files[name])), name=name)
+    return replace(from_mapping(Experiment, content, str(files[name])), name=name)
 
 
 def curves(experiment: Experiment, records: Sequence[Record], shown: bool = False) -> Curves:

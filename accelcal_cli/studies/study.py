@@ -24,7 +24,7 @@ from accelcal_cli.config import load_mapping, shipped_parameters
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.minimize import Run
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
-from accelcal_cli.schema import build
+from accelcal_cli.schema import from_mapping
 
 ALL = "all"
 
@@ -157,7 +157,7 @@ def load_entries(path: Path) -> dict[str, Entry]:
 def _entry(item: Any, where: str) -> Entry:
     if not isinstance(item, Mapping) or "optimizer" not in item:
         raise ConfigError(f'{where}: expected a mapping with the key "optimizer"')
-    entry = build(Entry, {key: value for key, value in item.items() if key != "source"}, where)
+    entry = from_mapping(Entry, {key: value for key, value in item.items() if key != "source"}, where)
     label = entry.label or entry.optimizer
     if "," in label or label == ALL:
         raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')

@@ -90,7 +90,8 @@ def _misses(rows: Sequence[Row]) -> list[str]:
         if excess is not None and rate < 1.0:
             cost = "within 1 %" if excess <= WITHIN else f"{1.0 + excess:.3g} times as high"
             sentences.append(
-                f"{row['optimizer']} came within 1 % of the least cost in {rate:.0%} of its runs; its median run is {cost}."
+                f"{row['optimizer']} came within 1 % of the least cost in {rate:.0%} of its runs; "
+                f"its median run is {cost}."
             )
     return sentences
 
