@@ -102,7 +102,8 @@ def command(
 
 def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.benchmark import curves, rank
+    from accelcal_cli.studies.benchmark import rank
+    from accelcal_cli.studies.study import median_curves
     from accelcal_cli.views.studies import benchmark_table, benchmark_title, ranking_table
 
     rows = benchmark_table(study, records)
@@ -115,13 +116,13 @@ def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
 
         ranking = rank(study, records)
         further = [ranking_table(ranking)] if ranking else []
-        show_benchmark(benchmark_title(study), rows, curves(study, records), study.tolerance, further)
+        show_benchmark(benchmark_title(study), rows, median_curves(study, records), study.tolerance, further)
     sys.stdout.flush()
 
 
 def _plot(study: Benchmark, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.benchmark import curves
+    from accelcal_cli.studies.study import median_curves
     from accelcal_cli.views.studies import benchmark_title
 
-    plot_convergence(benchmark_title(study), curves(study, records), study.tolerance, path)
+    plot_convergence(benchmark_title(study), median_curves(study, records), study.tolerance, path)

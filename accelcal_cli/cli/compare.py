@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -184,7 +184,7 @@ def _recorded(data: str, columns: str | None, g: float, simulation: Sequence[str
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.compare import curves
+    from accelcal_cli.studies.study import median_curves
     from accelcal_cli.views.experiments import comparison_conditions, comparison_subject, comparison_table
 
     rows = comparison_table(study, records)
@@ -195,7 +195,8 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     else:
         from accelcal_cli.output.console import show_study
 
-        plotted: dict[str, Any] = {"Convergence": found} if (found := curves(study, records)) else {}
+        panels = median_curves(study, records)
+        plotted = {"Convergence": panels[""]} if panels[""] else {}
         title, note = comparison_subject(study), comparison_conditions(study)
         show_study(title, [replace(rows.filled(), title="")], plotted, note)
     sys.stdout.flush()
@@ -203,9 +204,9 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
 
 def _plot(study: Comparison, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.compare import curves
+    from accelcal_cli.studies.study import median_curves
     from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
 
     tolerance = 0.0 if study.noisy else study.tolerance
-    panels = {comparison_conditions(study): curves(study, records)}
+    panels = {comparison_conditions(study): median_curves(study, records)[""]}
     plot_convergence(comparison_subject(study), panels, tolerance, path)

@@ -57,7 +57,7 @@ def command(
         navigate.reproduce(name, runs, seed, raw, jobs, cluster, resume, plot, format, quiet)
         return
     experiment = reproduce.load(name).changed(runs, seed)
-    records = running.run(experiment.study(), raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
+    records = running.run(experiment, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     _show(experiment, records, format)
     if plot is not None:
         from accelcal_cli.output.plot import plot_convergence

@@ -6,7 +6,7 @@ the fitness.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -65,129 +65,113 @@ class EvolvingFilter(ParticleFilter):
         """
 
     @property
-    def evolution(self) -> EvolutionStrategy:
+    def evolution(self) -> Evolution:
         """The strategy that the settings select."""
-        return EvolveAll() if self.mode == "literal" else EvolveWorst()
+        return evolve_all if self.mode == "literal" else evolve_degenerate
 
     def update(self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams) -> tuple[Cloud, float, Bool]:
         """Return the cloud evolved and weighed; see `ParticleFilter.update`."""
         if not self.generations:
             return super().update(scenario, cloud, k, streams)
-        return self.evolution.update(self, scenario, cloud, k, streams)
+        return self.evolution(self, scenario, cloud, k, streams)
 
 
-class EvolutionStrategy(ABC):
-    """Which particles an evolution moves, when, and toward what."""
+Evolution = Callable[[EvolvingFilter, Scenario, Cloud, int, Streams], tuple[Cloud, float, Bool]]
+"""A strategy: which particles of a filter move at an epoch, and toward what; see `ParticleFilter.update`."""
 
-    @abstractmethod
-    def update(
-        self, form: EvolvingFilter, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
-    ) -> tuple[Cloud, float, Bool]:
-        """Return the cloud of a filter evolved and weighed; see `ParticleFilter.update`."""
+Move = Callable[[EvolvingFilter, Scenario, Cloud, Float, Streams], tuple[Cloud, int]]
+"""How the runs of a weighed cloud move; see `move_worst`."""
 
 
-class EvolveAll(EvolutionStrategy):
+def evolve_all(
+    form: EvolvingFilter, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
+) -> tuple[Cloud, float, Bool]:
     """As printed: all particles move at every epoch, toward the likelihood alone, and are then weighed."""
-
-    def update(
-        self, form: EvolvingFilter, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
-    ) -> tuple[Cloud, float, Bool]:
-        """Return the cloud of a filter evolved and weighed; see `ParticleFilter.update`."""
-        rate = CountedFitness(lambda position: form.likelihood(scenario, k, position))
-        x = cloud.x.copy()
-        fitness = rate(x)
-        x[..., :2] = form.evolve(x[..., :2], fitness, form.particles, rate, streams)
-        weighed = Cloud(x, cloud.log_weights + rate(x))
-        return weighed, rate.points / scenario.runs, fitness.max(axis=1) > BLIND
+    rate = CountedFitness(lambda position: form.likelihood(scenario, k, position))
+    x = cloud.x.copy()
+    fitness = rate(x)
+    x[..., :2] = form.evolve(x[..., :2], fitness, form.particles, rate, streams)
+    weighed = Cloud(x, cloud.log_weights + rate(x))
+    return weighed, rate.points / scenario.runs, fitness.max(axis=1) > BLIND
 
 
-class EvolveDegenerate(EvolutionStrategy):
-    """Particles are weighed first, and evolve only in the runs whose weights degenerate.
+def move_worst(
+    form: EvolvingFilter, recent: Scenario, cloud: Cloud, prior: Float, streams: Streams
+) -> tuple[Cloud, int]:
+    """Move the worst particles toward the posterior, within three sigma; their old weight becomes the mean one.
 
-    Attributes:
-        memory: W, how many measurements the fitness looks at.
+    Args:
+        form: the filter.
+        recent: the measurements that the fitness looks at; the last one is that of the epoch.
+        cloud: weighed particles; prior: their weights as predicted, shape (R, N).
+        streams: of the runs.
+
+    Returns:
+        The cloud moved, and the look-ups of all its runs.
     """
+    mean, covariance = moments(prior, cloud.x[..., :2])
+    scale = np.sqrt(np.einsum("rii->ri", covariance)) + 1e-9
+    fitness = posterior(form, recent, mean, covariance)
 
-    def __init__(self, memory: int = 1) -> None:
-        """State the memory."""
-        self.memory = memory
+    def gated(position: Float) -> Float:
+        inside = (np.abs(position - mean[:, None]) <= GATE * scale[:, None]).all(axis=2)
+        return np.where(inside, fitness(position), -np.inf)
 
-    def update(
-        self, form: EvolvingFilter, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
-    ) -> tuple[Cloud, float, Bool]:
-        """Return the cloud of a filter weighed and evolved; see `ParticleFilter.update`."""
-        predicted = cloud.log_weights
-        cloud, lookups, on_map = ParticleFilter.update(form, scenario, cloud, k, streams)
-        rows = np.flatnonzero(form.degenerate(normalise(cloud.log_weights)))
-        if len(rows):
-            recent = scenario.part(rows, max(0, k + 1 - self.memory), k + 1)
-            part = Cloud(cloud.x[rows], cloud.log_weights[rows])
-            part, points = self.move(form, recent, part, normalise(predicted[rows]), streams.take(rows))
-            cloud.x[rows], cloud.log_weights[rows] = part.x, part.log_weights
-            lookups += points / scenario.runs
-        return cloud, lookups, on_map
-
-    @abstractmethod
-    def move(
-        self, form: EvolvingFilter, recent: Scenario, cloud: Cloud, prior: Float, streams: Streams
-    ) -> tuple[Cloud, int]:
-        """Return a weighed cloud moved, and the look-ups of all its runs.
-
-        Args:
-            form: the filter.
-            recent: the measurements that the fitness looks at; the last one is that of the epoch.
-            cloud: weighed particles; prior: their weights as predicted, shape (R, N).
-            streams: of its runs.
-        """
-
-    def posterior(self, form: EvolvingFilter, recent: Scenario, mean: Float, covariance: Float) -> Fitness:
-        """Return the logarithm of the likelihood of the recent measurements times the Gaussian of the predicted cloud.
-
-        Of several measurements it is the likelihood that holds if the position error is the same at all of them.
-
-        Args:
-            form: the filter; recent: the measurements.
-            mean, covariance: of the predicted positions, shape (R, 2) and (R, 2, 2).
-        """
-        inverse = np.linalg.inv(covariance + 1e-6 * np.eye(2))
-
-        def fitness(position: Float) -> Float:
-            away = position - mean[:, None]
-            distance = ((away @ inverse) * away).sum(axis=2)
-            likelihood = np.zeros(position.shape[:2])
-            for epoch in range(recent.epochs):
-                likelihood += form.likelihood(recent, epoch, position)
-            total: Float = likelihood - 0.5 * distance
-            return total
-
-        return fitness
+    rate = CountedFitness(gated)
+    order = np.argsort(cloud.log_weights, axis=1, kind="stable")
+    x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
+    logs = np.take_along_axis(cloud.log_weights, order, axis=1)
+    movers = max(1, round(form.fraction * form.particles))
+    position = x[..., :2]
+    moved = form.evolve(position, rate(position), movers, rate, streams)[:, :movers]
+    inside = np.isfinite(rate(moved))[:, :, None]
+    x[:, :movers, :2] = np.where(inside, moved, position[:, :movers])
+    share = np.take_along_axis(prior / prior.max(axis=1, keepdims=True), order, axis=1)[:, :movers]
+    likelihood = form.likelihood(recent, recent.epochs - 1, x[:, :movers])
+    logs[:, :movers] = likelihood + np.log(share.mean(axis=1, keepdims=True) + 1e-300)
+    return Cloud(x, logs), rate.points * recent.epochs + likelihood.size
 
 
-class EvolveWorst(EvolveDegenerate):
-    """The worst particles move toward the posterior, within three sigma; their old weight becomes the mean one."""
+def evolve_degenerate(
+    form: EvolvingFilter,
+    scenario: Scenario,
+    cloud: Cloud,
+    k: int,
+    streams: Streams,
+    move: Move = move_worst,
+    memory: int = 1,
+) -> tuple[Cloud, float, Bool]:
+    """Weigh the particles, and move them in the runs whose weights degenerate; W = memory measurements count."""
+    predicted = cloud.log_weights
+    cloud, lookups, on_map = ParticleFilter.update(form, scenario, cloud, k, streams)
+    rows = np.flatnonzero(form.degenerate(normalise(cloud.log_weights)))
+    if len(rows):
+        recent = scenario.part(rows, max(0, k + 1 - memory), k + 1)
+        part = Cloud(cloud.x[rows], cloud.log_weights[rows])
+        part, points = move(form, recent, part, normalise(predicted[rows]), streams.take(rows))
+        cloud.x[rows], cloud.log_weights[rows] = part.x, part.log_weights
+        lookups += points / scenario.runs
+    return cloud, lookups, on_map
 
-    def move(
-        self, form: EvolvingFilter, recent: Scenario, cloud: Cloud, prior: Float, streams: Streams
-    ) -> tuple[Cloud, int]:
-        """Return a weighed cloud moved; see `EvolveDegenerate.move`."""
-        mean, covariance = moments(prior, cloud.x[..., :2])
-        scale = np.sqrt(np.einsum("rii->ri", covariance)) + 1e-9
-        posterior = self.posterior(form, recent, mean, covariance)
 
-        def gated(position: Float) -> Float:
-            inside = (np.abs(position - mean[:, None]) <= GATE * scale[:, None]).all(axis=2)
-            return np.where(inside, posterior(position), -np.inf)
+def posterior(form: EvolvingFilter, recent: Scenario, mean: Float, covariance: Float) -> Fitness:
+    """Return the logarithm of the likelihood of the recent measurements times the Gaussian of the predicted cloud.
 
-        rate = CountedFitness(gated)
-        order = np.argsort(cloud.log_weights, axis=1, kind="stable")
-        x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
-        logs = np.take_along_axis(cloud.log_weights, order, axis=1)
-        movers = max(1, round(form.fraction * form.particles))
-        position = x[..., :2]
-        moved = form.evolve(position, rate(position), movers, rate, streams)[:, :movers]
-        inside = np.isfinite(rate(moved))[:, :, None]
-        x[:, :movers, :2] = np.where(inside, moved, position[:, :movers])
-        share = np.take_along_axis(prior / prior.max(axis=1, keepdims=True), order, axis=1)[:, :movers]
-        likelihood = form.likelihood(recent, recent.epochs - 1, x[:, :movers])
-        logs[:, :movers] = likelihood + np.log(share.mean(axis=1, keepdims=True) + 1e-300)
-        return Cloud(x, logs), rate.points * recent.epochs + likelihood.size
+    Of several measurements it is the likelihood that holds if the position error is the same at all of them.
+
+    Args:
+        form: the filter; recent: the measurements.
+        mean, covariance: of the predicted positions, shape (R, 2) and (R, 2, 2).
+    """
+    inverse = np.linalg.inv(covariance + 1e-6 * np.eye(2))
+
+    def fitness(position: Float) -> Float:
+        away = position - mean[:, None]
+        distance = ((away @ inverse) * away).sum(axis=2)
+        likelihood = np.zeros(position.shape[:2])
+        for epoch in range(recent.epochs):
+            likelihood += form.likelihood(recent, epoch, position)
+        likelihood -= 0.5 * distance
+        return likelihood
+
+    return fitness

@@ -45,11 +45,23 @@ class PositionEstimates:
         return cls(np.zeros((*shape, 2)), np.zeros((*shape, 2, 2)), np.zeros(shape[0]), 0.0)
 
 
+@dataclass(frozen=True)
 class Filter(ABC):
-    """A filter; its dataclass fields are its YAML keys."""
+    """A filter; its dataclass fields are its YAML keys.
+
+    Raises:
+        ConfigError: a setting out of range.
+    """
 
     name: ClassVar[str]
-    mode: str
+
+    mode: Literal["default", "literal"] = setting(
+        "default", "`literal`: as the paper prints it, with R as stated; `default`: R enlarged"
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check(self)
 
     @abstractmethod
     def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
@@ -165,7 +177,6 @@ CHUNK = 60
 class ParticleFilter(Filter):
     """The plain particle filter; [depf2015] section 6 without step 3."""
 
-    mode: Literal["default", "literal"] = setting("default", "`literal`: R as stated; `default`: R enlarged")
     particles: int = setting(100, "N, particles", low=4, high=1_000_000)
     roughening: float = setting(
         30.0, "noise of the position error per step of 10 s, m", low=0.0, high=10_000.0
@@ -179,10 +190,6 @@ class ParticleFilter(Filter):
     threshold: float = setting(2 / 3, "resample when N_eff is below this part of N", low=0.0, high=1.0)
     resampling: Literal["systematic", "residual"] = setting("systematic", "scheme")
     state: Literal[2, 12] = setting(2, "position error alone, or all twelve errors")
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
 
     def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
         """Return the estimates: propagate, weigh, evolve, estimate, resample; [depf2015] steps 1 to 5."""

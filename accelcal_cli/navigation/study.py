@@ -57,7 +57,7 @@ class FilterEntry:
 
     def with_settings(self, stated: Mapping[str, Any]) -> FilterEntry:
         """Return the filter with settings of the command line; None, and a setting that it lacks, are left out."""
-        known = {f.name for f in fields(FILTERS.get(self.filter))}  # type: ignore[arg-type]
+        known = {f.name for f in fields(FILTERS.get(self.filter))}
         own = {name: value for name, value in stated.items() if value is not None and name in known}
         return replace(self, parameters={**self.parameters, **own})
 

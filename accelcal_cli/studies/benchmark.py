@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,7 +24,6 @@ from accelcal_cli.studies.study import (
     Row,
     Study,
     Task,
-    median_curve,
     records_of,
     records_of_cell,
 )
@@ -159,16 +158,6 @@ def _statistics(records: Sequence[Record]) -> Row:
         "failures": sum(r.status == Status.FAILED.name.lower() for r in records),
         "seconds": float(np.median([r.seconds for r in records])),
     }
-
-
-def curves(study: Benchmark, records: Sequence[Record]) -> Mapping[str, Mapping[str, tuple[Float, Float]]]:
-    """Return the median convergence (evaluations, cost) by function and optimizer."""
-    panels: dict[str, dict[str, tuple[Float, Float]]] = {name: {} for name in study.functions}
-    for cell, (name, entry) in enumerate(study.pairs):
-        curve = median_curve(records_of_cell(records, cell))
-        if curve is not None:
-            panels[name][entry.label] = curve
-    return panels
 
 
 LEVEL = 0.05

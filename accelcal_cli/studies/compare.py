@@ -35,7 +35,6 @@ from accelcal_cli.studies.study import (
     Row,
     Study,
     Task,
-    median_curve,
     records_of,
     records_of_cell,
 )
@@ -133,12 +132,6 @@ def _polish(problem: Loetters, run: Run) -> Run:
         evaluations=run.evaluations + polished.evaluations,
         trace=None,
     )
-
-
-def curves(study: Comparison, records: Sequence[Record]) -> Mapping[str, tuple[Float, Float]]:
-    """Return the median convergence (evaluations, cost) by optimizer."""
-    by_label = {e.label: median_curve(records_of_cell(records, i)) for i, e in enumerate(study.entries)}
-    return {label: curve for label, curve in by_label.items() if curve is not None}
 
 
 ROUNDING = 1e-12

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -12,18 +13,16 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.schema import from_mapping
-from accelcal_cli.studies import benchmark, compare
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison, PrintedEstimate
 from accelcal_cli.studies.scenarios import SearchSpace, Simulation
-from accelcal_cli.studies.study import Entry, Record, Study, Task
+from accelcal_cli.studies.study import Curves, Entry, Record, Study, Task, median_curves
 
 STUDIES = "studies"
 
 CHECKPOINTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Parts of the evaluations at which the convergence table reads the curves."""
 
-Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
 Show = Literal["summary", "successful", "curves", "parameters"]
 
 
@@ -86,8 +85,8 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """An experiment of a paper.
+class Experiment(Study):
+    """An experiment of a paper: its parts run, kept and resumed as one study, their cells numbered through.
 
     Attributes:
         title, source: what it is and where it stands; note: what to know when reading it.
@@ -110,42 +109,29 @@ class Experiment:
         stated: dict[str, Any] = {k: v for k, v in (("runs", runs), ("seed", seed)) if v is not None}
         return replace(self, parts=tuple(replace(part, **stated) for part in self.parts))
 
-    def study(self) -> JoinedStudy:
-        """Return all parts as one study."""
-        return JoinedStudy(
-            tuple(part.title for part in self.parts), tuple(part.study() for part in self.parts)
-        )
-
-
-@dataclass(frozen=True)
-class JoinedStudy(Study):
-    """Several studies run, kept and resumed as one; their cells are numbered through.
-
-    Attributes:
-        titles: of the studies; studies: themselves.
-    """
-
-    titles: tuple[str, ...]
-    studies: tuple[Study, ...]
+    @cached_property
+    def studies(self) -> tuple[Benchmark | Comparison, ...]:
+        """The studies of the parts."""
+        return tuple(part.study() for part in self.parts)
 
     @property
     def cells(self) -> int:
-        """Cells of all studies."""
-        return self._first(len(self.studies))
+        """Cells of all parts."""
+        return self._first(len(self.parts))
 
     @property
     def runs(self) -> int:
-        """Runs of the study that has most."""
-        return max(study.runs for study in self.studies)
+        """Runs of the part that has most."""
+        return max(part.runs for part in self.parts)
 
     def names(self, cell: int) -> dict[str, str]:
-        """Return study, function and optimizer of a cell; the function of a calibration is its own word."""
+        """Return part, function and optimizer of a cell; the function of a calibration is its own word."""
         part, own = self._locate(cell)
         names = self.studies[part].names(own)
-        return {"part": self.titles[part], "function": names.get("function", "calibration")} | names
+        return {"part": self.parts[part].title, "function": names.get("function", "calibration")} | names
 
     def tasks(self) -> list[Task]:
-        """Return the tasks of all studies."""
+        """Return the tasks of all parts."""
         return [
             replace(task, cell=task.cell + self._first(part))
             for part, study in enumerate(self.studies)
@@ -159,17 +145,17 @@ class JoinedStudy(Study):
         return [replace(record, cell=task.cell) for record in records]
 
     def records_of(self, part: int, records: Sequence[Record]) -> list[Record]:
-        """Return the records of one study, its cells numbered as it numbers them."""
+        """Return the records of one part, its cells numbered as in its own study."""
         first, end = self._first(part), self._first(part + 1)
         return [replace(r, cell=r.cell - first) for r in records if first <= r.cell < end]
 
     def _first(self, part: int) -> int:
-        """Return the number of a study's first cell."""
+        """Return the number of a part's first cell."""
         return sum(study.cells for study in self.studies[:part])
 
     def _locate(self, cell: int) -> tuple[int, int]:
-        """Return the study of a cell, and the cell's number there."""
-        part = max(p for p in range(len(self.studies)) if self._first(p) <= cell)
+        """Return the part of a cell, and the cell's number there."""
+        part = max(p for p in range(len(self.parts)) if self._first(p) <= cell)
         return part, cell - self._first(part)
 
 
@@ -213,20 +199,12 @@ def curves(experiment: Experiment, records: Sequence[Record], shown: bool = Fals
         experiment: the experiment; records: of its runs.
         shown: only of the parts that show their curves.
     """
-    study = experiment.study()
     panels: dict[str, Mapping[str, tuple[Float, Float]]] = {}
-    for number, part in enumerate(experiment.parts):
+    for number, (part, study) in enumerate(zip(experiment.parts, experiment.studies, strict=True)):
         if not shown or "curves" in part.show:
-            own = curves_of(part.study(), study.records_of(number, records))
+            own = median_curves(study, experiment.records_of(number, records))
             panels |= {name or part.title: panel for name, panel in own.items()}
     return panels
-
-
-def curves_of(study: Benchmark | Comparison, records: Sequence[Record]) -> Curves:
-    """Return the median convergence by function ("" for a calibration) and optimizer."""
-    if isinstance(study, Benchmark):
-        return benchmark.curves(study, records)
-    return {"": compare.curves(study, records)}
 
 
 def checkpoints(curves: Curves) -> tuple[list[float], list[tuple[str, str, list[float | None]]]]:

@@ -28,6 +28,9 @@ from accelcal_cli.schema import from_mapping
 
 ALL = "all"
 
+Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
+"""Evaluations and median best cost, by function or problem and by optimizer."""
+
 Row = Mapping[str, Any]
 """A row of statistics: names and numbers by the key of their column."""
 
@@ -320,3 +323,14 @@ def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple
     grid = np.linspace(max(n[0] for n, _ in curves), max(n[-1] for n, _ in curves), points)
     rows = [cost[np.searchsorted(n, grid, side="right") - 1] for n, cost in curves]
     return grid, np.median(rows, axis=0)
+
+
+def median_curves(study: Study, records: Sequence[Record]) -> Curves:
+    """Return the median curve of each cell that left one, by function ("" for a study without) and optimizer."""
+    panels: dict[str, dict[str, tuple[Float, Float]]] = {}
+    for cell in range(study.cells):
+        names, curve = study.names(cell), median_curve(records_of_cell(records, cell))
+        panel = panels.setdefault(names.get("function", ""), {})
+        if curve is not None:
+            panel[names["optimizer"]] = curve
+    return panels

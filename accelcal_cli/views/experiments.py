@@ -9,9 +9,9 @@ from typing import Any
 from accelcal_cli.studies import compare, reproduce
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison, Estimates
-from accelcal_cli.studies.reproduce import Curves, Experiment, PaperTable, Part
+from accelcal_cli.studies.reproduce import Experiment, PaperTable, Part
 from accelcal_cli.studies.scenarios import WITHIN, Recording
-from accelcal_cli.studies.study import Record, Row
+from accelcal_cli.studies.study import Curves, Record, Row, median_curves
 from accelcal_cli.table import Column, Table
 from accelcal_cli.views.studies import benchmark_table, table_of
 
@@ -120,10 +120,9 @@ def catalogue_table() -> Table:
 
 def experiment_tables(experiment: Experiment, records: Sequence[Record]) -> list[Table]:
     """Return what is to be printed of an experiment's records, part by part."""
-    study = experiment.study()
     tables = []
     for number, part in enumerate(experiment.parts):
-        for table in _part_tables(part, study.records_of(number, records)):
+        for table in _part_tables(part, experiment.records_of(number, records)):
             title = f"{part.title}: {table.title}" if table.title else part.title
             tables.append(replace(table, title=title).filled())
     return tables
@@ -141,7 +140,7 @@ def _part_tables(part: Part, records: Sequence[Record]) -> list[Table]:
             )
             tables.append(with_paper_rows(replace(ours, title=""), part.paper))
         elif show == "curves":
-            tables.append(checkpoint_table(reproduce.curves_of(study, records)))
+            tables.append(checkpoint_table(median_curves(study, records)))
         elif show == "successful" and isinstance(study, Comparison):
             rows = compare.statistics(study, records, only_successful=True)
             tables.append(table_of("successful runs alone", COMPARISON, rows))

@@ -11,6 +11,7 @@ the paper's text reads. Only the first particles move, while best and worst are 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -19,11 +20,11 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.navigation.evolution import (
     CountedFitness,
-    EvolutionStrategy,
-    EvolveDegenerate,
-    EvolveWorst,
+    Evolution,
     EvolvingFilter,
     Fitness,
+    evolve_degenerate,
+    posterior,
 )
 from accelcal_cli.navigation.marginal import MarginalFilter, de_mc_generation
 from accelcal_cli.navigation.particle_filter import (
@@ -90,12 +91,12 @@ class DePf(EvolvingFilter):
                 raise ConfigError(f"{key.name}: has no effect with strategy {self.strategy}; leave it out")
 
     @property
-    def evolution(self) -> EvolutionStrategy:
+    def evolution(self) -> Evolution:
         """The strategy that the settings select; `marginal` is a filter of its own, see `run`."""
         if self.mode == "default" and self.strategy == "window":
-            return EvolveWorst(self.window)
+            return partial(evolve_degenerate, memory=self.window)
         if self.mode == "default" and self.strategy == "metropolis":
-            return ResampleMove()
+            return partial(evolve_degenerate, move=resample_move)
         return super().evolution
 
     def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
@@ -148,18 +149,18 @@ class DePf(EvolvingFilter):
         return base + F * (leader - base) + F * (one - take_particles(x, second))
 
 
-class ResampleMove(EvolveDegenerate):
-    """The particles are resampled, and all move by DE-MC on prior times likelihood [terbraak2006]."""
+def resample_move(
+    form: EvolvingFilter, recent: Scenario, cloud: Cloud, prior: Float, streams: Streams
+) -> tuple[Cloud, int]:
+    """Resample, and move all by DE-MC on prior times likelihood [terbraak2006]; the weights are equal after.
 
-    def move(
-        self, form: EvolvingFilter, recent: Scenario, cloud: Cloud, prior: Float, streams: Streams
-    ) -> tuple[Cloud, int]:
-        """Return a weighed cloud moved, its weights equal; see `EvolveDegenerate.move`."""
-        rate = CountedFitness(self.posterior(form, recent, *moments(prior, cloud.x[..., :2])))
-        chosen = systematic(normalise(cloud.log_weights), streams.uniform(1, 1)[:, 0, 0])
-        x = np.take_along_axis(cloud.x, chosen[:, :, None], axis=1)
-        position, level = x[..., :2], rate(x[..., :2])
-        for _ in range(form.generations):
-            position, level = de_mc_generation(position, level, rate, streams)
-        x[..., :2] = position
-        return Cloud(x, np.zeros(cloud.log_weights.shape)), rate.points
+    See `move_worst` for arguments and results.
+    """
+    rate = CountedFitness(posterior(form, recent, *moments(prior, cloud.x[..., :2])))
+    chosen = systematic(normalise(cloud.log_weights), streams.uniform(1, 1)[:, 0, 0])
+    x = np.take_along_axis(cloud.x, chosen[:, :, None], axis=1)
+    position, level = x[..., :2], rate(x[..., :2])
+    for _ in range(form.generations):
+        position, level = de_mc_generation(position, level, rate, streams)
+    x[..., :2] = position
+    return Cloud(x, np.zeros(cloud.log_weights.shape)), rate.points

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
 from accelcal_cli.navigation.particle_filter import FILTERS, Filter, PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.rng import Streams
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import setting
 
 CHUNK = 60
 NEGLIGIBLE = 1e-6
@@ -60,9 +59,8 @@ class Bank:
 @FILTERS.register("reference")
 @dataclass(frozen=True)
 class Reference(Filter):
-    """Gaussian sum of extended Kalman filters [alspach1972]; it draws no random number."""
+    """Gaussian sum of extended Kalman filters [alspach1972]; it draws no random number, and has one mode."""
 
-    mode: Literal["default", "literal"] = setting("default", "the same filter in both modes")
     components: int = setting(5, "on either axis of the initial square", low=1, high=50)
     recovery_inflation: float = setting(
         4.0,
@@ -70,10 +68,6 @@ class Reference(Filter):
         low=1.0,
         high=100.0,
     )
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
 
     def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:  # noqa: ARG002
         """Return the filter's estimates; see `Filter`."""
