@@ -6,10 +6,9 @@ import io
 
 import numpy as np
 
-from accelcal_cli.config import load_sensor
 from accelcal_cli.detection.rawlog import RawLog, RawRows, open_raw_log
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, handled
+from accelcal_cli.sensor.simulation import Handling, handled, load_sensor
 
 G = 9.80665
 

@@ -101,7 +101,8 @@ def command(
     Exit code 1 means that the verdict is "undetermined" or that --tolerance was missed.
     """
     from accelcal_cli.calibration.calibrate import calibrate
-    from accelcal_cli.config import load_mapping, load_settings
+    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.config import load_mapping
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 

@@ -73,7 +73,8 @@ def command(
     Exit code 1 means that a sensor is undetermined or failed, or missed the --tolerance.
     """
     from accelcal_cli.calibration.fleet import calibrate_fleet, check_settings
-    from accelcal_cli.config import load_mapping, load_settings
+    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.config import load_mapping
     from accelcal_cli.io.fleet import read_fleet
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 

@@ -102,16 +102,16 @@ def load_result(source: str, data: str | None = None) -> Calibration:
         UsageError: standard input is a terminal, or `data` is to come from it, too.
         ConfigError, DataError: no result file.
     """
-    from accelcal_cli import config
+    from accelcal_cli.calibration import result
 
     if source != "-":
-        return config.load_result(source)
+        return result.load_result(source)
     if data == "-":
         raise UsageError(
             "- -: standard input is one file; expected the name of the result file or of the readings"
         )
     check_input(source)
-    return config.load_result("<stdin>", sys.stdin.buffer)
+    return result.load_result("<stdin>", sys.stdin.buffer)
 
 
 def gravity(g: float | None, latitude: float | None, height: float | None) -> float | None:
@@ -353,7 +353,7 @@ def run(
     _check(raw, jobs, cluster, resume)
     from accelcal_cli.output.machine import write_raw
     from accelcal_cli.studies.engine import Journal, run_study
-    from accelcal_cli.studies.study import raw_table
+    from accelcal_cli.views.studies import raw_table
 
     journal = Journal.open(Path(f"{raw}.journal") if raw else None, study, resume)
     try:

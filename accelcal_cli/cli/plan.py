@@ -93,7 +93,8 @@ def command(
 def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.calibrate import calibrate
-    from accelcal_cli.config import is_result, load_result, load_settings
+    from accelcal_cli.calibration.result import is_result, load_result
+    from accelcal_cli.calibration.settings import load_settings
     from accelcal_cli.io.readings import read_readings
 
     options.check_input(data)

@@ -67,14 +67,14 @@ def command(
     --sensors they carry the label of their sensor, and `fleet` calibrates each. With --raw they are a log of time,
     acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
-    from accelcal_cli.config import dump, load_sensor
+    from accelcal_cli.config import dump
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.output.machine import write_log
     from accelcal_cli.rng import Purpose, Streams
-    from accelcal_cli.schema import build
+    from accelcal_cli.schema import from_mapping
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import Handling, handled, simulate, simulate_fleet
+    from accelcal_cli.sensor.simulation import Handling, handled, load_sensor, simulate, simulate_fleet
 
     if noise is not None and not 0 <= noise <= LARGEST_NOISE:
         raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
@@ -102,7 +102,7 @@ def command(
     record = _truth(device, local_g, sigma, u)
     with whole_file(output) as file:
         if raw:
-            log = handled(device, u, local_g, build(Handling, handling, "simulate --raw"), sigma, seed)
+            log = handled(device, u, local_g, from_mapping(Handling, handling, "simulate --raw"), sigma, seed)
             record["holds"] = [list(rows) for rows in write_log(log, gyro, file)]
         elif sensors is not None:
             drawn = simulate_fleet(device, sensors, u, local_g, samples, sigma, seed)

@@ -14,7 +14,6 @@ from accelcal_cli.calibration.observability import attitudes
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import shared_variance, state
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.config import load_sensor
 from accelcal_cli.detection.detect import MULTIPLIERS, TIE, Candidate, DetectSettings, best, detect
 from accelcal_cli.detection.rawlog import open_raw_log
 from accelcal_cli.detection.windows import Span, Spans
@@ -22,6 +21,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import fibonacci
+from accelcal_cli.sensor.simulation import load_sensor
 
 XSENS = ErrorModel(
     np.array([[414.441645, 0, 0], [1.477289, 412.122680, 0], [3.832964, 8.841874, 414.507889]]),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from accelcal_cli.config import load_result
+from accelcal_cli.calibration.result import load_result
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from accelcal_cli.config import load_result
+from accelcal_cli.calibration.result import load_result
 
 G = "9.80665"
 
