@@ -1,11 +1,7 @@
-"""A raw log: three accelerometer columns at a fixed rate, with time and three gyroscope columns where they exist.
+"""A raw log: acceleration at a fixed rate, with time and turning rate where there are such columns.
 
-What the time column of a raw log says: its unit, the rate, and dates as seconds.
-
-Gaps in the time column of a raw log: what is before and after one is not the same rest.
-
-They are told from the first and the last time of each tile, which are kept anyway: only the rows of a tile that
-lasts too long are looked at.
+`RawLog` reads a table once, from top to bottom, and tells from its first rows what the time column is: its unit and the
+rate (`Clock`), a row number, dates, or no time at all.
 """
 
 from __future__ import annotations
@@ -14,6 +10,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -24,10 +21,48 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import RawColumns, choose_raw
 from accelcal_cli.io.reader import Table, open_table
-from accelcal_cli.io.text import Rows, shorten
+from accelcal_cli.io.text import RowBlock, shorten
 
 PROBE = 1000
 """Rows that tell the step of the time column, and whether a column without a name is one."""
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of a time column, in seconds."""
+
+SLOWEST = 1.0
+"""Hz: no raw log is slower, so the time of a slower one is taken to be in a smaller unit."""
+
+_UNIT = re.compile(
+    r"(?:.*[\W_])?(?:(s|secs?|seconds?)|(ms|msecs?|millis|milliseconds?)|([uµμ]s|[uµμ]secs?|micros|microseconds?)"
+    r"|(ns|nsecs?|nanos|nanoseconds?))[\W_]*",
+    re.IGNORECASE,
+)
+_ZONE = re.compile(r"(?:[zZ]|[+-]\d\d(?::?\d\d)?)$")
+
+
+def open_raw_log(
+    source: str | Path,
+    columns: Sequence[str] | None = None,
+    gyro: Sequence[str] | None = None,
+    time: str | None = None,
+    *,
+    stdin: BinaryIO | None = None,
+) -> RawLog:
+    """Open a raw log in any form that `read_readings` reads; ``-`` is standard input.
+
+    Args:
+        source: path, or ``-``.
+        columns, gyro: three columns each, by name or by number from 1; found by their names when None; no
+            gyroscope with `gyro` of ``["none"]``.
+        time: a column, ``"none"``, or None to find it.
+        stdin: standard input.
+    """
+    table = open_table(source, stdin)
+    try:
+        return RawLog(table, choose_raw(table, columns, gyro, time))
+    except BaseException:
+        table.close()
+        raise
 
 
 @dataclass(frozen=True)
@@ -59,7 +94,7 @@ class RawLog:
         self._table = table
         self._rows = table.blocks(columns.selection())
         if columns.dated:
-            self._rows = dated(self._rows, self._time_at)
+            self._rows = seconds_of_dates(self._rows, self._time_at)
         self._head = _first(self._rows, PROBE)
         self.clock = Clock()
         self.notes = list(columns.notes)
@@ -67,9 +102,10 @@ class RawLog:
 
     def _settle_time(self) -> None:
         """Take the time column for what it is: time, a row number, or no time at all."""
-        columns, times = self.columns, _column(self._head, -1)[:PROBE]
+        columns = self.columns
         if columns.time is None:
             return
+        times = np.concatenate([np.empty(0), *(rows.numbers[:, -1] for rows in self._head)])[:PROBE]
         steps = np.diff(times)
         if columns.guessed and not (len(steps) and (steps >= 0).all() and (steps > 0).any()):
             if columns.doubtful:
@@ -83,19 +119,19 @@ class RawLog:
             self.notes.append(f"column {columns.time + 1} taken as time: it never decreases")
         if self.clock.rate is None:
             self.columns = replace(columns, time=None)
-            self.notes.append(f"column {columns.time + 1} counts rows, it is no time")
+            self.notes.append(f"column {columns.time + 1} counts rows, so it is not time")
         elif self.clock.unit != "s":
-            self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows a second")
+            self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows per second")
 
     def _unit(self) -> str | None:
-        """Unit of the time column, where it is known before its steps are."""
+        """Return the unit of the time column, where it is known before its steps are."""
         if self.columns.dated:
             return "s"
         names, time = self._table.names, self.columns.time
         return None if names is None or time is None else unit_of(names[time])
 
     def _time_at(self, row: int) -> str:
-        """How to name the time of a row (from 0) that has been read."""
+        """Return how to name the time of a row (from 0) that has been read."""
         names, time = self._table.names, self.columns.time or 0
         column = str(time + 1) if names is None else f'"{names[time]}"'
         return f"{self.name}, {self.where(row)}, column {column}"
@@ -112,25 +148,17 @@ class RawLog:
 
     def blocks(self) -> Iterator[RawRows]:
         """Yield the rows, block after block, in constant memory; time that goes back is a DataError."""
-        last = -np.inf
-        while self._head:
-            rows = self._head.pop(0)
-            raw = self._part(rows.numbers)
+        last, sensors, timed = -np.inf, 6 if self.columns.gyro else 3, self.columns.time is not None
+        for rows in chain(self._head, self._rows):
+            raw = RawRows(rows.numbers[:, : sensors + timed], sensors == 6, timed)
             if raw.time is not None and len(raw.time):
                 self._check_time(raw.time, last, rows.start)
                 last = float(raw.time[-1])
             yield raw
-            if not self._head:
-                self._head.extend(_first(self._rows, 1))
 
     def close(self) -> None:
         """Release the file."""
         self._table.close()
-
-    def _part(self, numbers: Float) -> RawRows:
-        sensors = 6 if self.columns.gyro else 3
-        timed = self.columns.time is not None
-        return RawRows(numbers[:, : sensors + timed], sensors == 6, timed)
 
     def _check_time(self, time: Float, last: float, start: int) -> None:
         back = np.diff(time, prepend=last) < 0
@@ -144,66 +172,12 @@ class RawLog:
         )
 
 
-def open_raw_log(
-    source: str | Path,
-    columns: Sequence[str] | None = None,
-    gyro: Sequence[str] | None = None,
-    time: str | None = None,
-    *,
-    stdin: BinaryIO | None = None,
-) -> RawLog:
-    """Open a raw log in any form that `read_readings` reads; ``-`` is standard input.
-
-    Args:
-        source: path, or ``-``.
-        columns, gyro: three columns each, by name or by number from 1; found by their names when None; no
-            gyroscope with `gyro` of ``["none"]``.
-        time: a column, ``"none"``, or None to find it.
-        stdin: standard input.
-    """
-    table = open_table(source, stdin)
-    try:
-        return RawLog(table, choose_raw(table, columns, gyro, time))
-    except BaseException:
-        table.close()
-        raise
-
-
-def _first(rows: Iterator[Rows], least: int) -> list[Rows]:
-    """Take blocks until they hold `least` rows, or all there are."""
-    taken: list[Rows] = []
-    while sum(len(block.numbers) for block in taken) < least:
-        block = next(rows, None)
-        if block is None:
-            break
-        taken.append(block)
-    return taken
-
-
-def _column(blocks: list[Rows], k: int) -> Float:
-    return np.concatenate([np.empty(0), *(block.numbers[:, k] for block in blocks)])
-
-
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Units of a time column, in seconds."""
-
-SLOWEST = 1.0
-"""Hz: no raw log is slower, so a slower one is taken as being in a smaller unit of time."""
-
-_UNIT = re.compile(
-    r"(?:.*[\W_])?(?:(s|secs?|seconds?)|(ms|msecs?|millis|milliseconds?)|([uµμ]s|[uµμ]secs?|micros|microseconds?)"
-    r"|(ns|nsecs?|nanos|nanoseconds?))[\W_]*",
-    re.IGNORECASE,
-)
-_ZONE = re.compile(r"(?:[zZ]|[+-]\d\d(?::?\d\d)?)$")
-
-
 @dataclass(frozen=True)
 class Clock:
     """What the time column says.
 
     Attributes:
-        rate: rows a second, Hz; None where nothing says it.
+        rate: rows per second, Hz; None where nothing tells it.
         unit: of the time column: s, ms, us or ns.
     """
 
@@ -212,7 +186,7 @@ class Clock:
 
     @property
     def period(self) -> float | None:
-        """From row to row, in the unit of the time column; None where nothing says it."""
+        """Time from row to row, in the unit of the time column; None where nothing tells it."""
         return None if self.rate is None else 1.0 / (self.rate * UNITS[self.unit])
 
     @classmethod
@@ -234,12 +208,12 @@ class Clock:
 
 def unit_of(name: str) -> str | None:
     """Return the unit that the name of a time column ends in, as in ``timestamp_ms`` or ``time [us]``."""
-    found = _UNIT.fullmatch(name.strip())
-    return None if found is None else list(UNITS)[next(k for k, part in enumerate(found.groups()) if part)]
+    match = _UNIT.fullmatch(name.strip())
+    return None if match is None else list(UNITS)[next(k for k, part in enumerate(match.groups()) if part)]
 
 
-def dated(rows: Iterable[Rows], place: Callable[[int], str]) -> Iterator[Rows]:
-    """Yield rows whose text is a date and a time with the seconds since the first row as one more column.
+def seconds_of_dates(rows: Iterable[RowBlock], place: Callable[[int], str]) -> Iterator[RowBlock]:
+    """Yield rows whose text is date and time with the seconds since the first row as one more column.
 
     Args:
         rows: blocks with text; place: how to name a row (from 0) and its column.
@@ -253,7 +227,7 @@ def dated(rows: Iterable[Rows], place: Callable[[int], str]) -> Iterator[Rows]:
         stamps = _stamps([cell.removesuffix(zone) for cell in text], block.start, text, place)
         first = first if len(first) else stamps[:1]
         seconds = (stamps - first).astype(np.int64) / 1e9
-        yield Rows(block.start, np.column_stack([block.numbers, seconds]))
+        yield RowBlock(block.start, np.column_stack([block.numbers, seconds]))
 
 
 def _stamps(
@@ -267,14 +241,14 @@ def _stamps(
             pass
     wrong = next(k for k, cell in enumerate(cells) if not _is_stamp(cell))
     raise DataError(
-        f"{place(start + wrong)}: {shorten(shown[wrong])} is no time; expected numbers, or dates as "
+        f"{place(start + wrong)}: {shorten(shown[wrong])} is not a time; expected numbers, or dates as "
         "2026-03-01T12:30:00.25, all in one time zone (--time none leaves it out)"
     )
 
 
 def _read(cells: list[str]) -> NDArray[np.datetime64]:
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of a time zone, which numpy would drop
+        warnings.simplefilter("error")  # about a time zone, which numpy would drop
         return np.array(cells, dtype="datetime64[ns]")
 
 
@@ -283,3 +257,11 @@ def _is_stamp(cell: str) -> bool:
         return cell[:4].isdigit() and not np.isnat(_read([cell])[0])
     except (ValueError, UserWarning):
         return False
+
+
+def _first(rows: Iterator[RowBlock], least: int) -> list[RowBlock]:
+    """Take blocks until they hold `least` rows, or all there are."""
+    head: list[RowBlock] = []
+    while sum(len(block.numbers) for block in head) < least and (block := next(rows, None)):
+        head.append(block)
+    return head

@@ -1,4 +1,4 @@
-"""Numeric tables as streams of row blocks: one face for text of any dialect and for Parquet."""
+"""Numeric tables as streams of row blocks: one interface for text of any dialect and for Parquet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import BinaryIO, Protocol
 
 from accelcal_cli.io.dialect import looks_numeric, sniff
 from accelcal_cli.io.stream import ByteSource, open_source
-from accelcal_cli.io.text import CarefulParser, FastParser, LineMap, Rows, Selection
+from accelcal_cli.io.text import CarefulParser, FastParser, LineMap, RowBlock, Selection
 
 
 class Table(Protocol):
@@ -24,7 +24,7 @@ class Table(Protocol):
 
     @property
     def numeric(self) -> tuple[bool, ...]:
-        """Which columns hold numbers, judged by type or by the first row."""
+        """Whether each column holds numbers, judged by type or by the first row."""
 
     @property
     def has_rows(self) -> bool:
@@ -34,12 +34,12 @@ class Table(Protocol):
     def sha256(self) -> str:
         """SHA-256 of the input, once all blocks have been read."""
 
-    def blocks(self, selection: Selection) -> Iterator[Rows]:
+    def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns, block after block, in constant memory."""
 
     @property
     def where(self) -> Callable[[int], str]:
-        """How to name a row (from 0) that has been read, such as ``line 8``; outlives the table."""
+        """How to name a row (from 0) that has been read, such as ``line 8``; usable after the table is closed."""
 
     def close(self) -> None:
         """Release the file."""
@@ -64,12 +64,12 @@ class TextTable:
         """SHA-256 of the bytes read so far."""
         return self._source.sha256
 
-    def blocks(self, selection: Selection) -> Iterator[Rows]:
+    def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns; short inputs never import polars."""
         for _, rows in self.pairs(selection):
             yield rows
 
-    def pairs(self, selection: Selection) -> Iterator[tuple[bytes, Rows]]:
+    def pairs(self, selection: Selection) -> Iterator[tuple[bytes, RowBlock]]:
         """Read blocks of whole lines, each with the selected columns of its rows."""
         careful = CarefulParser(self.name, self.dialect, selection)
         self._lines = careful.lines
@@ -93,24 +93,20 @@ class TextTable:
 
 def open_table(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> Table:
     """Open a table of any supported form; ``-`` is standard input. Without the hash it is read a little faster."""
-    stream = open_source(source, stdin, hashed=hashed)
+    stream, path = open_source(source, stdin, hashed=hashed), None if str(source) == "-" else Path(source)
     try:
-        return _table(stream, None if str(source) == "-" else Path(source))
+        if stream.head.startswith(b"PAR1") or (path and path.suffix.lower() in {".parquet", ".pq"}):
+            from accelcal_cli.io.parquet import ParquetTable
+
+            return ParquetTable(stream, path)
+        return TextTable(stream)
     except BaseException:
         stream.close()
         raise
 
 
-def _table(stream: ByteSource, path: Path | None) -> Table:
-    if stream.head.startswith(b"PAR1") or (path is not None and path.suffix.lower() in {".parquet", ".pq"}):
-        from accelcal_cli.io.parquet import ParquetTable
-
-        return ParquetTable(stream, path)
-    return TextTable(stream)
-
-
 def _top(block: bytes, header_line: int) -> int:
-    """Bytes of the lines up to the header, or of the first line."""
+    """Return the number of bytes up to the end of the header, or of the first line."""
     end = 0
     for _ in range(max(header_line, 1)):
         end = block.find(b"\n", end) + 1 or len(block)

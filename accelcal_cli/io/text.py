@@ -1,6 +1,7 @@
-"""The careful parser of table rows: it defines what a table means and names the cell that is wrong.
+"""The rows of a text table: what its cells mean, and how to read them fast.
 
-The fast parser of table rows: polars on whole blocks, wherever that is sure to mean the same.
+`CarefulParser` reads line by line in Python: it defines what a table means and names the cell that is wrong.
+`FastParser` lets polars read whole blocks wherever that is sure to mean the same.
 """
 
 from __future__ import annotations
@@ -14,18 +15,20 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.dialect import BOM, Dialect, decode_line, is_blank
+from accelcal_cli.io.dialect import BOM, Dialect, decode_line, is_blank, split_cells
 
 if TYPE_CHECKING:
     import polars as pl
 
+LIMIT = 1e100
+"""Largest reading: greater values cannot be squared safely."""
 
-LIMIT = 1e100  # larger values cannot be squared safely
-SHOWN = 40  # characters of a bad cell that are shown
+SHOWN = 40
+"""Characters of a bad cell that a message shows."""
+
 NO_LABEL = "is empty; every row needs its label"
 
 
@@ -39,8 +42,11 @@ class Selection:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """A block of rows: `numbers` (B, k) and `texts`, each of length B, in the order of the selection."""
+class RowBlock:
+    """Rows of a table: `numbers` (B, k) and `texts`, each of length B, in the order of the selection.
+
+    `start` is the number of the first row in the table, from 0.
+    """
 
     start: int
     numbers: Float
@@ -61,12 +67,12 @@ class LineMap:
             self.lines.append(line)
 
     def line(self, row: int) -> int:
-        """Line number of a row."""
+        """Return the line number of a row."""
         k = bisect.bisect_right(self.rows, row) - 1
         return self.lines[k] + row - self.rows[k]
 
     def where(self, row: int) -> str:
-        """How to name a row: ``line 8``."""
+        """Return how to name a row: ``line 8``."""
         return f"line {self.line(row)}"
 
 
@@ -82,8 +88,8 @@ class CarefulParser:
         self.row = 0  # rows so far
         self.line = 0  # lines so far
 
-    def parse(self, block: bytes) -> Rows:
-        """Rows of a block of whole lines; the first wrong cell raises DataError."""
+    def parse(self, block: bytes) -> RowBlock:
+        """Return the rows of a block of whole lines; the first wrong cell raises DataError."""
         start, values = self.row, array("d")
         texts: tuple[list[str], ...] = tuple([] for _ in self.selection.texts)
         for raw in io.BytesIO(block):
@@ -98,10 +104,10 @@ class CarefulParser:
                 text.append(self._label(cells[column], column))
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
-        return Rows(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+        return RowBlock(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
 
     def skip(self, rows: int) -> int:
-        """Note that `rows` rows were read elsewhere, one a line; return the first one's number."""
+        """Note that `rows` rows were read elsewhere, one per line; return the number of the first."""
         start = self.row
         self.lines.add(start, self.line + 1)
         self.row += rows
@@ -110,15 +116,15 @@ class CarefulParser:
 
     def _cells(self, line: str) -> list[str]:
         if line.count('"') % 2:
-            raise DataError(f"{self._here()}: a quotation mark is not closed on its line")
-        cells = self.dialect.split(line.rstrip("\r\n"))
+            raise DataError(f"{self._place()}: a quotation mark is not closed on its line")
+        cells = split_cells(line.rstrip("\r\n"), self.dialect.separator)
         width = self.dialect.width
         if len(cells) == width + 1 and not cells[-1]:
             return cells[:-1]  # a separator at the end of the line
         if len(cells) != width:
             whose = "the header has" if self.dialect.header_line else "the first row has"
             plural = "" if len(cells) == 1 else "s"
-            raise DataError(f"{self._here()}: has {len(cells)} cell{plural} where {whose} {width}")
+            raise DataError(f"{self._place()}: has {len(cells)} cell{plural} where {whose} {width}")
         return cells
 
     def _number(self, cell: str, column: int) -> float:
@@ -127,24 +133,24 @@ class CarefulParser:
             return value
         if column in self.selection.gaps and (not cell or (value is not None and math.isnan(value))):
             return math.nan
-        where = f"{self._here()}, column {self._column(column)}"
-        raise DataError(f"{where}: {_complaint(cell, value, self.dialect.decimal_comma)}")
+        raise DataError(f"{self._place(column)}: {_describe_cell(cell, value, self.dialect.decimal_comma)}")
 
     def _label(self, cell: str, column: int) -> str:
         if cell:
             return cell
-        raise DataError(f"{self._here()}, column {self._column(column)}: {NO_LABEL}")
+        raise DataError(f"{self._place(column)}: {NO_LABEL}")
 
-    def _here(self) -> str:
-        return f"{self.source}, line {self.line}"
-
-    def _column(self, column: int) -> str:
-        names = self.dialect.names
-        return f'"{names[column]}"' if names is not None and names[column] else str(column + 1)
+    def _place(self, column: int | None = None) -> str:
+        """Return where the parser is, for a message."""
+        here, names = f"{self.source}, line {self.line}", self.dialect.names
+        if column is None:
+            return here
+        name = f'"{names[column]}"' if names is not None and names[column] else column + 1
+        return f"{here}, column {name}"
 
 
 def to_number(cell: str, decimal_comma: bool) -> float | None:
-    """Value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
+    """Return the value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
     if decimal_comma:
         if "." in cell:
             return None  # 1.234,5 and 1.234 would be thousands here
@@ -158,11 +164,12 @@ def to_number(cell: str, decimal_comma: bool) -> float | None:
 
 
 def shorten(text: str) -> str:
-    """Text in quotes, cut where it is long."""
+    """Return a text in quotes, cut where it is long."""
     return f'"{text}"' if len(text) <= SHOWN else f'"{text[:SHOWN]}..."'
 
 
-def _complaint(cell: str, value: float | None, decimal_comma: bool) -> str:
+def _describe_cell(cell: str, value: float | None, decimal_comma: bool) -> str:
+    """Say what is wrong with a cell that has no number, or has one that is no reading."""
     if not cell:
         return "is empty; a number was expected"
     shown = shorten(cell)
@@ -188,19 +195,17 @@ class FastParser:
         """Share rows, lines and selection with `careful`."""
         self.careful = careful
 
-    def parse(self, block: bytes) -> Rows:
-        """Rows of a block of whole lines."""
-        for form in (self._bare, self._plain):
-            plain = form(block)
-            frame = None if plain is None else self._frame(plain)
-            numbers = None if frame is None else self._numbers(frame)
-            texts = None if frame is None else self._texts(frame)
-            if numbers is not None and texts is not None:
-                return Rows(self.careful.skip(len(numbers)), numbers, texts)
+    def parse(self, block: bytes) -> RowBlock:
+        """Return the rows of a block of whole lines."""
+        for prepare in (self._bare, self._plain):
+            plain = prepare(block)
+            rows = None if plain is None else self._rows(plain)
+            if rows is not None:
+                return rows
         return self.careful.parse(block)
 
     def _bare(self, block: bytes) -> bytes | None:
-        """The block as it is, where every column is read as a number, so that nothing odd can hide."""
+        """Return the block as it is, where every column is read as a number, so that nothing odd can hide."""
         dialect, selection = self.careful.dialect, self.careful.selection
         if len(set(selection.numbers)) < dialect.width or selection.texts:
             return None
@@ -208,7 +213,7 @@ class FastParser:
         return None if doubtful else block
 
     def _plain(self, block: bytes) -> bytes | None:
-        """The block with one-byte separators only, or None if it needs care."""
+        """Return the block with one-byte separators only, None if it needs care."""
         dialect = self.careful.dialect
         if b"#" in block or b"\0" in block or not block.endswith(b"\n"):
             return None
@@ -224,6 +229,24 @@ class FastParser:
         if b'"' in block and (dialect.separator == " " or squeezed != block):
             return None  # blanks within quotes belong to the cell
         return None if b"\r" in squeezed or has_outer_blank_line(squeezed) else squeezed
+
+    def _rows(self, block: bytes) -> RowBlock | None:
+        """Return the rows of a block that polars can read, None where a cell is missing or out of range."""
+        frame, selection = self._frame(block), self.careful.selection
+        if frame is None:
+            return None
+        series = [frame[str(column)] for column in selection.numbers]
+        if any(column.null_count() for column in series):
+            return None
+        numbers = np.array(
+            [column.to_numpy() for column in series]
+        ).T  # column after column: faster to reduce
+        if not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
+            return None
+        texts = tuple([(cell or "").strip() for cell in frame[str(k)].to_list()] for k in selection.texts)
+        if not all(all(text) for text in texts):
+            return None
+        return RowBlock(self.careful.skip(len(frame)), numbers, texts)
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
@@ -249,30 +272,9 @@ class FastParser:
             return None if short else frame
         return frame
 
-    def _numbers(self, frame: pl.DataFrame) -> NDArray[np.float64] | None:
-        columns = self.careful.selection.numbers
-        numbers = np.empty((len(columns), len(frame))).T  # one column after the other: faster to reduce
-        for k, column in enumerate(columns):
-            series = frame[str(column)]
-            if series.null_count():
-                return None
-            numbers[:, k] = series.to_numpy()
-        sound = numbers.min() >= -LIMIT and numbers.max() <= LIMIT  # nan fails both
-        return numbers if sound else None
-
-    def _texts(self, frame: pl.DataFrame) -> tuple[list[str], ...] | None:
-        """Stripped text of the text columns, None where a cell is empty."""
-        found = []
-        for column in self.careful.selection.texts:
-            text = [(cell or "").strip() for cell in frame[str(column)].to_list()]
-            if not all(text):
-                return None
-            found.append(text)
-        return tuple(found)
-
 
 def has_outer_blank_line(block: bytes) -> bool:
-    """Whether a block begins or ends with a blank line; polars passes over these without a null."""
+    """Return whether a block begins or ends with a blank line; polars passes over these without a null."""
     return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
 
 

@@ -158,7 +158,7 @@ def test_dates_with_a_decimal_comma():
 def test_a_date_that_is_none_is_named(wrong, late):
     lines = with_dates(str).split(b"\n")
     lines[late] = wrong.encode() + lines[late][lines[late].index(b",") :]
-    with pytest.raises(DataError, match=f'line {late + 1}, column "time": ".*" is no time; .*--time none'):
+    with pytest.raises(DataError, match=f'line {late + 1}, column "time": ".*" is not a time; .*--time none'):
         read(opened(b"\n".join(lines)))
 
 

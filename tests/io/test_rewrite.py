@@ -123,7 +123,7 @@ def test_both_writers_read_back_to_the_same_numbers(monkeypatch):
 
 
 def test_polars_is_used_for_plain_blocks(monkeypatch):
-    monkeypatch.setattr(module._Lines, "_careful", lambda self, block, values: pytest.fail("not needed"))
+    monkeypatch.setattr(module._LineWriter, "_careful", lambda self, block, values: pytest.fail("not needed"))
     monkeypatch.setattr(module, "SMALL", 0)
     text = body(60).encode()
     assert run(text, wanted=["2", "3", "4"], small=False, monkeypatch=monkeypatch).count(b"\n") == 60
