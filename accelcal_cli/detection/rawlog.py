@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import RawColumns, choose_raw
-from accelcal_cli.io.reader import Table, open_table
-from accelcal_cli.io.text import RowBlock, shorten
+from accelcal_cli.io.reader import RowBlock, Table, open_table, shorten
 
 PROBE = 1000
 """Rows that tell the step of the time column, and whether a column without a name is one."""

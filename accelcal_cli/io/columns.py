@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
-from accelcal_cli.io.reader import Table
-from accelcal_cli.io.text import Selection
+from accelcal_cli.io.reader import Selection, Table
 
 Triple = tuple[int, int, int]
-Group = dict[tuple[str, int], dict[str, int]]
-"""Columns by axis, of each family of names; the number tells triples of one family name apart."""
+Group = dict[str, tuple[list[int], list[int], list[int]]]
+"""Columns of each axis, by family of names; a second column of one name opens a second triple."""
 
 AXES = "xyz"
 
@@ -303,14 +302,16 @@ def recognise(names: Sequence[str]) -> Roles:
         for group, prefixes in ((reference, _REFERENCE), (output, _OUTPUT), (gyro, _GYRO)):
             if not axis and (axis := _axis(key, prefixes)):
                 _put(group, axis, column)
-    roles.families = {_listed(names, triple): triple for triple in _triples(output).values()}
-    again = [by for (_, turn), by in output.items() if turn and len(by) < len(AXES)]
-    roles.doubtful = [names[column] for by in again for column in by.values()]
-    for (family, _), triple in _triples(spread).items():
+    roles.families = {_listed(names, triple): triple for _, triple in _triples(output)}
+    roles.doubtful = [names[column] for column in _left_over(output, 1)]
+    for family, triple in _triples(spread):
         roles.scatter.setdefault(family, triple)
-    roles.reference = next(iter(_triples(reference).values()), None)
-    roles.gyro = next(iter(_triples(gyro).values()), None)
-    roles.partial = _lacking(spread, names, "standard deviation") + _lacking(reference, names, "reference")
+    roles.reference = next((triple for _, triple in _triples(reference)), None)
+    roles.gyro = next((triple for _, triple in _triples(gyro)), None)
+    for group, what in ((spread, "standard deviation"), (reference, "reference")):
+        roles.partial += [
+            f'column "{names[k]}" not used: no {what} for all three axes' for k in _left_over(group)
+        ]
     return roles
 
 
@@ -463,21 +464,19 @@ def _spread(words: Sequence[str], key: str) -> tuple[str, str] | None:
 
 
 def _put(group: Group, place: tuple[str, str], column: int) -> None:
-    """File a column under its family and axis; a second column of one name opens a second triple."""
     family, axis = place
-    turn = 0
-    while axis in group.setdefault((family, turn), {}):
-        turn += 1
-    group[family, turn][axis] = column
+    group.setdefault(family, ([], [], []))[AXES.index(axis)].append(column)
 
 
-def _triples(group: Group) -> dict[tuple[str, int], Triple]:
-    return {key: (by["x"], by["y"], by["z"]) for key, by in group.items() if len(by) == len(AXES)}
+def _triples(group: Group) -> list[tuple[str, Triple]]:
+    """Return family and columns of every triple that has all axes."""
+    return [(family, triple) for family, axes in group.items() for triple in zip(*axes, strict=False)]
 
 
-def _lacking(group: Group, names: Sequence[str], what: str) -> list[str]:
-    short = [column for by in group.values() if len(by) < len(AXES) for column in by.values()]
-    return [f'column "{names[column]}" not used: no {what} for all three axes' for column in short]
+def _left_over(group: Group, least: int = 0) -> list[int]:
+    """Return the columns of incomplete triples; with `least` 1 those of a second triple and later ones alone."""
+    ends = (axis[max(least, min(map(len, axes))) :] for axes in group.values() for axis in axes)
+    return sorted(column for end in ends for column in end)
 
 
 def _listed(names: Sequence[str], columns: Sequence[int], between: str = ", ") -> str:

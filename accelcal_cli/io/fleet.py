@@ -9,7 +9,6 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,11 +17,10 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_column
-from accelcal_cli.io.reader import Table, open_table
+from accelcal_cli.io.reader import RowBlock, Table, open_table
 from accelcal_cli.io.readings import LabelledMeans, Readings, check_rows
 from accelcal_cli.io.screening import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.io.stream import RowStore
-from accelcal_cli.io.text import RowBlock
 
 SLAB = 2_000_000
 """Poses that are in memory at once, unless one sensor has more."""
@@ -110,13 +108,9 @@ class FleetReadings:
     _store: RowStore = field(repr=False)  # number of the sensor, output
     _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
 
-    @cached_property
-    def _firsts(self) -> list[int]:
-        return [origin.first for origin in self.origins]
-
     def origin(self, pose: int) -> TableOrigin:
         """Return the table that a pose came from, by its number among all."""
-        return self.origins[bisect.bisect_right(self._firsts, pose) - 1]
+        return self.origins[bisect.bisect_right(self.origins, pose, key=lambda origin: origin.first) - 1]
 
     def where(self, pose: int) -> str:
         """Return how to name a pose, by its number among all: ``line 8``."""

@@ -13,10 +13,9 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.reader import Table
+from accelcal_cli.io.reader import LIMIT, NO_LABEL, RowBlock, Selection, Table
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
-from accelcal_cli.io.text import LIMIT, NO_LABEL, RowBlock, Selection
 
 ROWS = 500_000
 """Rows of a block."""

@@ -18,10 +18,9 @@ from numpy.typing import ArrayLike
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import Table, open_table
+from accelcal_cli.io.reader import LIMIT, RowBlock, Table, open_table
 from accelcal_cli.io.screening import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
-from accelcal_cli.io.text import LIMIT, RowBlock
 
 STUCK = 1_000_000
 """Equal readings in a row after which an input is not read on."""

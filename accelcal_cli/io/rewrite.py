@@ -14,9 +14,8 @@ from typing import IO, TYPE_CHECKING
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.io.dialect import BOM, Dialect, is_blank, split_cells
-from accelcal_cli.io.reader import TextTable
+from accelcal_cli.io.reader import Selection, TextTable, has_outer_blank_line
 from accelcal_cli.io.stream import BackgroundThread
-from accelcal_cli.io.text import Selection, has_outer_blank_line
 
 if TYPE_CHECKING:
     import polars as pl

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from simulated import MEMS
 
-from accelcal_cli.detection.capture import Capture, rough_sensor
+from accelcal_cli.detection.capture import Capture, fit_rough_sensor
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.readings import read_readings
 from accelcal_cli.io.serial import port_lines
@@ -67,7 +67,7 @@ def take(stream, capture):
 
 
 def test_the_rough_sensor_of_one_pose_is_centred():
-    rough = rough_sensor(np.array([[0.0, 0.0, 5.0]]), None, None)
+    rough = fit_rough_sensor(np.array([[0.0, 0.0, 5.0]]), None, None)
     np.testing.assert_allclose(rough.centre, 0.0, atol=1e-12)
     assert rough.scale == pytest.approx(5.0)
 
@@ -75,13 +75,13 @@ def test_the_rough_sensor_of_one_pose_is_centred():
 @pytest.mark.parametrize("bias", [[0, 0, 0], [0.4, -0.8, 0.3], [512, 512, 512]])
 def test_the_rough_sensor_finds_the_sphere(bias):
     outputs = 100.0 * PLANNED + np.array(bias)
-    rough = rough_sensor(outputs, None, None)
+    rough = fit_rough_sensor(outputs, None, None)
     np.testing.assert_allclose(rough.centre, bias, atol=1.0)
     assert rough.scale == pytest.approx(100.0, rel=0.01)
 
 
 def test_what_is_stated_is_kept():
-    rough = rough_sensor(100.0 * PLANNED + 7.0, 50.0, np.full(3, 7.0))
+    rough = fit_rough_sensor(100.0 * PLANNED + 7.0, 50.0, np.full(3, 7.0))
     assert rough.scale == 50.0
     np.testing.assert_array_equal(rough.centre, [7.0] * 3)
     np.testing.assert_allclose(rough.directions(100.0 * PLANNED + 7.0), PLANNED)
@@ -101,7 +101,7 @@ def test_every_pose_that_is_held_is_taken_once():
 def test_a_pose_is_the_mean_of_its_readings():
     capture = Capture(PLANNED, window=30, hold=80)
     take(hand(PLANNED, sigma=0.02), capture)
-    for pose, direction in zip(capture.taken, PLANNED, strict=True):
+    for pose, direction in zip(capture.poses, PLANNED, strict=True):
         assert pose.n == 80
         np.testing.assert_allclose(pose.mean, MEMS.output(G * direction), atol=5 * 0.02 / np.sqrt(80))
         np.testing.assert_allclose(pose.spread, 0.02, rtol=0.4)

@@ -12,10 +12,9 @@ import pytest
 from accelcal_cli.errors import DataError
 from accelcal_cli.io import rewrite as module
 from accelcal_cli.io.columns import choose
-from accelcal_cli.io.reader import TextTable, open_table
+from accelcal_cli.io.reader import Selection, TextTable, open_table
 from accelcal_cli.io.rewrite import Change, rewrite
 from accelcal_cli.io.stream import ByteSource
-from accelcal_cli.io.text import Selection
 
 
 def third(numbers):
