@@ -50,7 +50,7 @@ MOVING = 0.05
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """How poses are found.
+    """How the poses of a log are found.
 
     Attributes:
         spans: window, still period, least length, trim.
@@ -96,7 +96,7 @@ class Detection:
     Attributes:
         source, sha256, columns: of the log; log_rows: its rows; notes: what a user should know of it.
         rate: rows per second, Hz, or None; rows: the lengths used.
-        level: what the multipliers multiply; multiplier: the one kept; candidates: all of them.
+        level: what the multipliers apply to; multiplier: the one kept; candidates: all of them.
         intervals: the poses.
         envelope: of the log, for a picture; None unless asked for.
     """
@@ -123,7 +123,7 @@ class Detection:
         )
 
     def summary(self) -> str:
-        """Say what was found, and with which settings, in one sentence."""
+        """Return what was found, and with which settings, in one sentence."""
         rows = self.rows
         by = "the quietest windows" if rows.still is None else f"the first {rows.still:,} rows"
         tried = f", the best of {len(self.candidates)}" if len(self.candidates) > 1 else ""
@@ -152,7 +152,7 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
 
     Raises:
         UsageError: lengths that do not fit the log. DataError: unreadable.
-        TooFewPosesError: it says what was found.
+        TooFewPosesError: no multiplier finds enough attitudes; the message says what was found.
     """
     rate = settings.rate if settings.rate is not None else log.clock.rate
     lengths = settings.spans.rows(rate)

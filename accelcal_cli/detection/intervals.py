@@ -37,7 +37,7 @@ FEWEST_QUIET, MOST_QUIET = 0.002, 0.02
 STILL_POSES = 12
 
 ACCELEROMETER_QUIET = 2.0
-"""Windows up to this multiple of the quietest variance tell how much a gyroscope turns at rest."""
+"""Windows up to this multiple of the quietest variance show what a gyroscope reads at rest."""
 
 MOST_TURNING = 0.75
 """Part of those windows that turn at most as much as the level."""
@@ -218,7 +218,7 @@ def find_runs(
     still_before = np.zeros(len(multipliers), dtype=bool)
     for block in windows(tiles, lengths.width):
         turning = block.turning(level.bias)
-        whole = ~block.broken  # nobody knows what happened in a gap
+        whole = ~block.broken  # what happened in a gap is unknown
         for k, multiplier in enumerate(multipliers):
             calm = (block.variance <= multiplier * level.variance) & (turning <= multiplier * level.turning)
             still = whole & calm

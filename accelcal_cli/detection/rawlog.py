@@ -1,7 +1,7 @@
 """A raw log: acceleration at a fixed rate, with time and turning rate where there are such columns.
 
-`RawLog` reads a table once, from top to bottom, and tells from its first rows what the time column is: its unit and the
-rate (`Clock`), a row number, dates, or no time at all.
+`RawLog` reads a table once, from top to bottom. Its first rows show what the time column is: time of some unit and rate
+(`Clock`), dates, a row number, or no time at all.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from accelcal_cli.io.columns import RawColumns, choose_raw
 from accelcal_cli.io.reader import RowBlock, Table, open_table, shorten
 
 PROBE = 1000
-"""Rows that tell the step of the time column, and whether a column without a name is one."""
+"""Rows that determine the step of the time column, and whether a column without a name is time."""
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of a time column, in seconds."""
 
 SLOWEST = 1.0
-"""Hz: no raw log is slower, so the time of a slower one is taken to be in a smaller unit."""
+"""Hz: no raw log is slower, so the time of one that seems slower is in a smaller unit."""
 
 _UNIT = re.compile(
     r"(?:.*[\W_])?(?:(s|secs?|seconds?)|(ms|msecs?|millis|milliseconds?)|([uµμ]s|[uµμ]secs?|micros|microseconds?)"
@@ -87,7 +87,7 @@ class RawLog:
     """A raw log that is read once, from top to bottom."""
 
     def __init__(self, table: Table, columns: RawColumns) -> None:
-        """Read the first rows of `table`: they tell what the time column is."""
+        """Read the first rows of `table` to find out what the time column is."""
         self.name = table.name
         self.columns = columns
         self._table = table
@@ -173,10 +173,10 @@ class RawLog:
 
 @dataclass(frozen=True)
 class Clock:
-    """What the time column says.
+    """Rate and unit of the time column.
 
     Attributes:
-        rate: rows per second, Hz; None where nothing tells it.
+        rate: rows per second, Hz; None where it is unknown.
         unit: of the time column: s, ms, us or ns.
     """
 
@@ -185,15 +185,15 @@ class Clock:
 
     @property
     def period(self) -> float | None:
-        """Time from row to row, in the unit of the time column; None where nothing tells it."""
+        """Time from row to row, in the unit of the time column; None where the rate is unknown."""
         return None if self.rate is None else 1.0 / (self.rate * UNITS[self.unit])
 
     @classmethod
     def of(cls, time: Float, unit: str | None = None) -> Self:
-        """Tell the rate from the first rows, shape (n,), and the unit where it is not stated.
+        """Return rate and unit, where it is not stated, from the times of the first rows, shape (n,).
 
-        Without a unit a step of exactly 1 counts rows and says nothing of time. A stated unit that makes the log
-        slower than any is not believed.
+        Without a unit a step of exactly 1 counts rows and gives no rate. A stated unit that would make the log
+        slower than SLOWEST is ignored.
         """
         steps = np.diff(time)
         steps = steps[steps > 0]

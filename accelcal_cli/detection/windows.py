@@ -6,7 +6,7 @@ counted from the first row of the log and squares are taken about each tile's ow
 the blocks that the rows come in, to the last bit, and nothing cancels.
 
 `Spans` are the lengths as a user states them, `RowLengths` what they are in rows. `Gaps` are those of the time column:
-what is before and after one is not the same rest. `Envelope` keeps the extent of the log for a picture.
+what is before and after one is not the same pose. `Envelope` keeps the extent of the log for a picture.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TILES = 10
 """Tiles in a window: it slides by a tenth of its length."""
 
 WINDOW_SECONDS, WINDOW_ROWS = 1.0, 101
-"""Default window [tedaldi2014]: one second, or as many rows as that paper's at 100 Hz when nothing tells the rate."""
+"""Default window [tedaldi2014]: one second, or as many rows as that paper's at 100 Hz when the rate is unknown."""
 
 LEAST_SECONDS, LEAST_ROWS = 1.0, 100
 """Default least length of a still interval, after its edges are trimmed."""
@@ -154,8 +154,7 @@ def longest_step(clock: Clock, lengths: RowLengths) -> float:
 class Gaps:
     """The gaps of a log, in constant memory.
 
-    They are told from the first and the last time of each tile: only the rows of a tile that lasts too long are
-    looked at.
+    They show in the first and the last time of each tile: only the rows of a tile that lasts too long are looked at.
 
     Attributes:
         longest: step that is no gap, in the unit of the time column; inf where there is no time.
@@ -355,7 +354,7 @@ class Envelope:
     def __init__(self, size: int) -> None:
         """Start without rows; a tile has `size` rows."""
         self.size, self.per_bin = size, 1
-        # Least output, less the greatest, and first time of each bin (b, 7): of bins taken together, the least.
+        # Least output, negative greatest output and first time of each bin, (b, 7): bins are joined by the minimum.
         self._bins: Float = np.empty((0, 7))
         self._open = self._bins  # tiles that do not fill a bin yet
 

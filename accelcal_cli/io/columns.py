@@ -1,8 +1,8 @@
-"""Which columns of a table are what: stated by the user, or told from their names.
+"""The columns of a table: which they are is stated by the user, or recognised by their names.
 
 `choose` finds the columns of a table of static readings, `choose_raw` those of a raw log, `sensor_column` the one that
-labels the sensor in a table of many sensors. All of them rest on `recognise`, which gives every column its role by its
-name. What is ambiguous is an error that says how to state it, never a guess.
+labels the sensor in a table of many sensors. All of them use `recognise`, which gives every column its role by its
+name. An ambiguous table is an error that says what to state; columns are never guessed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Group = dict[str, tuple[list[int], list[int], list[int]]]
 AXES = "xyz"
 
 NONE = "none"
-"""States that there is no gyroscope, or no time."""
+"""Option value for no gyroscope, or no time."""
 
 NAMELESS: dict[int, tuple[Triple, Triple | None, int | None]] = {
     3: ((0, 1, 2), None, None),
@@ -66,7 +66,7 @@ _ALONE = {
         r"|t|time|timestamp|stamp|start|end|stop|tstart|tend|starttime|endtime|index|row|sec|seconds|id"
     ),
 }
-"""Roles of columns that stand alone, by what their names are in one word; `other` are no readings."""
+"""Roles of single columns, by their names without separators; those of `other` are not readings."""
 
 _TIME = re.compile(r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?")
 _SENSOR_PERHAPS = re.compile(r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer")
@@ -98,7 +98,7 @@ class Columns:
 
     @property
     def extras(self) -> tuple[int, ...]:
-        """Numeric columns beside the output: count, scatter, reference, temperature, as far as present."""
+        """Numeric columns other than the output: count, scatter, reference, temperature, as far as present."""
         count, temperature = _present(self.count), _present(self.temperature)
         return (*count, *(self.scatter or ()), *(self.reference or ()), *temperature)
 
@@ -123,7 +123,7 @@ class RawColumns:
         gyro, time: None where there are none.
         dated: `time` holds dates, not numbers.
         guessed: `time` is only time when it never decreases.
-        doubtful: what to say when a guessed time column is none and so nothing is known of the others.
+        doubtful: the error when a guessed time column is not time, so that the others are unknown, too.
         notes: what a user should know.
     """
 
@@ -148,10 +148,10 @@ def choose(table: Table, wanted: Sequence[str] | None = None, sensor: int | None
     Args:
         table: of static readings, open.
         wanted: the three output columns, by name or number from 1; None to go by the names.
-        sensor: the column that says which sensor a row is of, in a table of many.
+        sensor: the column that labels the sensor, in a table of many sensors.
 
     Raises:
-        DataError: the table has no rows, or does not tell its columns. UsageError: `wanted` does not fit the table.
+        DataError: the table has no rows, or its columns are ambiguous. UsageError: `wanted` does not fit the table.
     """
     if not table.has_rows:
         raise DataError(f"{table.name}: has a header but no readings below it")
@@ -180,7 +180,7 @@ def choose_raw(
     """Find the columns of a raw log; what is stated wins over names, names over the number of columns.
 
     Raises:
-        DataError: the table does not say which columns to take.
+        DataError: the table is ambiguous.
         UsageError: a stated column does not exist or is stated twice.
     """
     if not table.has_rows:
@@ -198,7 +198,7 @@ def choose_raw(
 
 
 def sensor_column(table: Table, wanted: str | None = None) -> int:
-    """Find the column that says which sensor a row is of; DataError or UsageError if in doubt."""
+    """Find the column that labels the sensor; DataError or UsageError if in doubt."""
     option, names = "--sensor-column", table.names
     if wanted is not None:
         return find_column(table, wanted.strip(), option)
@@ -222,7 +222,7 @@ def sensor_column(table: Table, wanted: str | None = None) -> int:
 
 
 def own_sensor_column(table: Table) -> int | None:
-    """Return the column that labels the sensor in a table of one sensor, None where none or several say so."""
+    """Return the column that labels the sensor in a table of one sensor, None where there are none or several."""
     sensors = recognise(table.names or ()).alone["sensor"]
     return sensors[0] if len(sensors) == 1 else None
 
@@ -276,7 +276,7 @@ class Roles:
     partial: list[str] = field(default_factory=list)  # triples that lack an axis, in words
 
     def first(self, role: str) -> int | None:
-        """Return the first column of a role that stands alone."""
+        """Return the first single column of a role."""
         return next(iter(self.alone[role]), None)
 
 
@@ -340,7 +340,7 @@ def _only_family(table: Table, roles: Roles) -> Triple:
 
 
 def _only_three(table: Table, roles: Roles, sensor: int | None) -> Triple:
-    """Return the three columns that no name says to be something else, if there are just three."""
+    """Return the three columns whose names do not say that they are something else, if there are just three."""
     names, width = table.names, len(table.numeric)
     known = {*(roles.reference or ()), *roles.alone["other"], *roles.alone["sensor"], sensor}
     known.update(roles.first(role) for role in ("count", "temperature", "label"))
@@ -439,7 +439,7 @@ def _parse_gyro(table: Table, gyro: Sequence[str]) -> Triple | None:
 
 
 def _role(name: str, key: str) -> str | None:
-    """Return the role of a column that stands alone, None for an axis and for an unknown name."""
+    """Return the role of a single column, None for an axis and for an unknown name."""
     if _CAPITAL_T.fullmatch(name.strip()):
         return "temperature"
     return next((role for role, pattern in _ALONE.items() if pattern.fullmatch(key)), None)

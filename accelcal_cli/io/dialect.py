@@ -14,7 +14,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.stream import LONGEST_LINE
 
 SAMPLE = 1000
-"""Content lines that the dialect is told from."""
+"""Content lines that the dialect is found from."""
 
 BOM = b"\xef\xbb\xbf"
 

@@ -66,7 +66,7 @@ class Batch:
     Attributes:
         sensors: their numbers, shape (R,); count: poses of each, shape (R,).
         output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
-        behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table tells.
+        behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
         scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise.
     """
 

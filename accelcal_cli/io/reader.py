@@ -152,13 +152,13 @@ class TextTable:
 
 @dataclass
 class LineMap:
-    """Line number of every row, kept as the places where lines and rows part (blank lines, comments)."""
+    """Line number of every row, kept as the places where lines and rows diverge (blank lines, comments)."""
 
     rows: array[int] = field(default_factory=lambda: array("q"))
     lines: array[int] = field(default_factory=lambda: array("q"))
 
     def add(self, row: int, line: int) -> None:
-        """State that `row` (from 0) stands on `line` (from 1); rows after it follow line by line."""
+        """Note that `row` (from 0) is on `line` (from 1); the rows after it follow line by line."""
         if not self.rows or line - row != self.lines[-1] - self.rows[-1]:
             self.rows.append(row)
             self.lines.append(line)
@@ -250,7 +250,7 @@ class FastParser:
     """Parses what polars reads beyond doubt, and hands every other block to the careful parser.
 
     Beyond doubt: no quotes, comments or blank lines, every row as wide as the first, every number finite.
-    So the careful parser alone says what a table means, and words every error.
+    So the careful parser alone defines what a table means, and words every error.
     """
 
     def __init__(self, careful: CarefulParser) -> None:

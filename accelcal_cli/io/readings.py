@@ -122,7 +122,7 @@ class Readings:
         where: Callable[[int], str],
         cautions: tuple[str, ...] | None = None,
     ) -> Self:
-        """Return the same poses with the origin of the input that they were taken from, and its cautions if stated."""
+        """Return the same poses as those of another input, with its cautions if stated."""
         own = self.cautions if cautions is None else cautions
         return replace(self, sha256=sha256, columns=columns, notes=tuple(notes), cautions=own, _line=where)
 
@@ -133,8 +133,10 @@ def read_readings(
     """Read static readings from a text table or a Parquet file; ``-`` is standard input.
 
     `columns` names the three output columns, or numbers them from 1; without it their names decide.
-    Rows that share a position label are averaged. Every fault of the input is a DataError that says where,
-    every fault of `columns` a UsageError.
+    Rows that share a position label are averaged.
+
+    Raises:
+        DataError: a fault of the input, with its place. UsageError: a fault of `columns`.
     """
     table = open_table(source, stdin)
     try:
@@ -195,7 +197,9 @@ class Collector:
             self._extras.append(extras.copy())
             if self.store.rows > IN_MEMORY:
                 self._extras = None
-                self.notes.append(f"columns beside the readings not used: more than {IN_MEMORY:,} poses")
+                self.notes.append(
+                    f"columns other than the readings are not used: more than {IN_MEMORY:,} poses"
+                )
 
     def readings(self, sha256: str, where: Callable[[int], str] | None = None) -> Readings:
         """Return the poses of all rows; DataError where they are too few or all the same.
@@ -355,7 +359,7 @@ class LabelledMeans(Generic[Label]):
         return self.weight if self.weighted or (self.repeated and not self.spreads) else None
 
     def scatter(self) -> Float | None:
-        """Return the standard deviation of one raw reading (J, 3), sensor units; NaN where nothing tells it."""
+        """Return the standard deviation of one raw reading (J, 3), sensor units; NaN where it is unknown."""
         if not (self.spreads or self.repeated):
             return None
         freedom = (self.weight if self.spreads else self.rows)[:, None] - 1

@@ -70,7 +70,7 @@ def may_be_doubtful(output: Float, poses: Int) -> Bool:
     """Return which of R sensors to ask `doubts` about, shape (R,): all of those of which it has something to say.
 
     Args:
-        output: their poses, shape (R, J, 3), whatever stands after the last; poses: of each, shape (R,).
+        output: their poses, shape (R, J, 3), whatever follows the last; poses: of each, shape (R,).
     """
     real = np.arange(output.shape[1]) < poses[:, None]
     dead = ((output == output[:, :1]) | ~real[..., None]).all(axis=1).any(axis=1)

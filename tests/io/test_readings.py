@@ -201,7 +201,7 @@ def test_more_rows_than_memory_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     np.testing.assert_array_equal(readings.output(), rows[:, :3])
     np.testing.assert_array_equal(np.concatenate([block for _, block in readings.blocks(7)]), rows[:, :3])
     assert readings.temperature is None
-    assert "columns beside the readings not used: more than 100 poses" in readings.notes
+    assert "columns other than the readings are not used: more than 100 poses" in readings.notes
 
 
 def test_large_file_in_several_blocks(tmp_path: Path) -> None:
