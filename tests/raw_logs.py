@@ -7,7 +7,7 @@ import io
 import numpy as np
 
 from accelcal_cli.config import load_sensor
-from accelcal_cli.detection.rawlog import RawLog, RawRows, open_raw_log
+from accelcal_cli.detection.rawlog import RawLog, open_raw_log
 from accelcal_cli.sensor.poses import directions
 from accelcal_cli.sensor.simulation import Handling, simulate_log
 
@@ -27,12 +27,12 @@ def simulated(positions=14, *, seed=1, noise=0.03, gyro=True, timed=True, **hand
     return np.concatenate(parts), np.array(holds)
 
 
-def in_blocks(numbers, sizes, *, gyro=True, timed=True):
+def in_blocks(numbers, sizes):
     """The rows in blocks of the given sizes, over and over."""
     at, k = 0, 0
     while at < len(numbers):
         size = sizes[k % len(sizes)]
-        yield RawRows(numbers[at : at + size], gyro, timed)
+        yield numbers[at : at + size]
         at, k = at + size, k + 1
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Self
 
 import numpy as np
@@ -192,16 +193,11 @@ def _still_period(tiles: Tiles, lengths: RowLengths, quietest: float, name: str)
         raise DataError(
             f"{name}: has {tiles.rows:,} rows, fewer than the still period of {still:,} (--still)"
         )
-    parts, have = [], 0
-    for first, block in tiles.blocks():
-        if first >= wanted:
-            break
-        parts.append(block[: wanted - first, :6])
-        have += len(parts[-1])
-    block = np.concatenate(parts)
+    begin = takewhile(lambda numbered: numbered[0] < wanted, tiles.blocks())
+    block = np.concatenate([block[: wanted - first, :6] for first, block in begin])
     mean = block[:, :3].mean(axis=0)
     square = block[:, 3:6].sum(axis=0) + tiles.size * ((block[:, :3] - mean) ** 2).sum(axis=0)
-    level = float(np.linalg.norm(square / (have * tiles.size)))
+    level = float(np.linalg.norm(square / (len(block) * tiles.size)))
     if not 0 < level <= NOT_STILL * quietest:
         raise DataError(
             f"{name}: the first {still:,} rows are not still: variance {level:.4g}, {level / quietest:.3g} times "

@@ -64,25 +64,6 @@ def open_raw_log(
         raise
 
 
-@dataclass(frozen=True)
-class RawRows:
-    """A block of rows of a raw log.
-
-    Attributes:
-        numbers: acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, shape (B, k).
-        gyro, timed: which of them there are.
-    """
-
-    numbers: Float
-    gyro: bool = False
-    timed: bool = False
-
-    @property
-    def time(self) -> Float | None:
-        """Time of each row, shape (B,), as given."""
-        return self.numbers[:, -1] if self.timed else None
-
-
 class RawLog:
     """A raw log that is read once, from top to bottom."""
 
@@ -111,7 +92,9 @@ class RawLog:
                 raise DataError(columns.doubtful)
             self.columns = replace(columns, time=None)
             return
-        self.clock = Clock.of(times, self._unit())
+        names = self._table.names
+        unit = None if names is None else unit_of(names[columns.time])
+        self.clock = Clock.of(times, "s" if columns.dated else unit)
         if columns.dated:
             self.notes.append("time is counted in seconds from the first row")
         if columns.guessed:
@@ -121,13 +104,6 @@ class RawLog:
             self.notes.append(f"column {columns.time + 1} counts rows, so it is not time")
         elif self.clock.unit != "s":
             self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows per second")
-
-    def _unit(self) -> str | None:
-        """Return the unit of the time column, where it is known before its steps are."""
-        if self.columns.dated:
-            return "s"
-        names, time = self._table.names, self.columns.time
-        return None if names is None or time is None else unit_of(names[time])
 
     def _time_at(self, row: int) -> str:
         """Return how to name the time of a row (from 0) that has been read."""
@@ -145,15 +121,19 @@ class RawLog:
         """How to name a row (from 0) that has been read."""
         return self._table.where
 
-    def blocks(self) -> Iterator[RawRows]:
-        """Yield the rows, block after block, in constant memory; time that goes back is a DataError."""
-        last, sensors, timed = -np.inf, 6 if self.columns.gyro else 3, self.columns.time is not None
+    def blocks(self) -> Iterator[Float]:
+        """Yield the rows, block after block, in constant memory; time that goes back is a DataError.
+
+        Shape (B, k): acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, as given.
+        """
+        timed = self.columns.time is not None
+        width, last = (6 if self.columns.gyro else 3) + timed, -np.inf
         for rows in chain(self._head, self._rows):
-            raw = RawRows(rows.numbers[:, : sensors + timed], sensors == 6, timed)
-            if raw.time is not None and len(raw.time):
-                self._check_time(raw.time, last, rows.start)
-                last = float(raw.time[-1])
-            yield raw
+            numbers = rows.numbers[:, :width]
+            if timed and len(numbers):
+                self._check_time(numbers[:, -1], last, rows.start)
+                last = float(numbers[-1, -1])
+            yield numbers
 
     def close(self) -> None:
         """Release the file."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.detection.rawlog import UNITS, Clock, RawLog, RawRows
+from accelcal_cli.detection.rawlog import UNITS, Clock, RawLog
 from accelcal_cli.errors import UsageError
 from accelcal_cli.io.stream import RowStore
 
@@ -47,7 +47,9 @@ LATE = 10
 MOST_BINS = 4096
 """Bins of an envelope at most: more than a picture has columns of dots; then two become one."""
 
-_SPAN = re.compile(r"(.*?)\s*(?:(s|sec|seconds)|(r|row|rows|samples))?", re.IGNORECASE)
+_SPAN = re.compile(
+    r"(\+?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*(?:(s|sec|seconds)|(r|row|rows|samples))?", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -75,11 +77,8 @@ def parse_span(text: str | None, option: str) -> Span | None:
     if text is None:
         return None
     match = _SPAN.fullmatch(text.strip())
-    try:
-        value = float(match[1]) if match else math.nan
-    except ValueError:
-        value = math.nan
-    if match is None or not (math.isfinite(value) and value >= 0):
+    value = float(match[1]) if match else math.inf
+    if match is None or value == math.inf:
         raise UsageError(f'{option} "{text}": expected seconds, as in 1.5, or rows, as in 150rows')
     in_rows = match[3] is not None
     if in_rows and value != int(value):
@@ -235,9 +234,9 @@ class Tiles:
         """Number of tiles."""
         return self._store.rows
 
-    def add(self, raw: RawRows, envelope: Envelope | None = None) -> None:
-        """Add the next rows, to the `envelope`, too, if there is one."""
-        block = np.ascontiguousarray(raw.numbers.T)  # (k, B): one column after the other
+    def add(self, rows: Float, envelope: Envelope | None = None) -> None:
+        """Add the next rows, shape (B, k) as those of a RawLog; an `envelope` gets them, too."""
+        block = np.ascontiguousarray(rows.T)  # (k, B): one column after the other
         self.rows += block.shape[1]
         if self._rest is not None and self._rest.shape[1]:
             need = self.size - self._rest.shape[1]
@@ -285,8 +284,8 @@ def read_tiles(log: RawLog, lengths: RowLengths, envelope: Envelope | None = Non
     """Read a log to its end and return its tiles."""
     gyro, timed = log.columns.gyro is not None, log.columns.time is not None
     tiles = Tiles(lengths.tile, gyro, timed, longest_step(log.clock, lengths))
-    for raw in log.blocks():
-        tiles.add(raw, envelope)
+    for rows in log.blocks():
+        tiles.add(rows, envelope)
     return tiles
 
 

@@ -186,7 +186,10 @@ def choose_raw(
     if not table.has_rows:
         raise DataError(f"{table.name}: has a header but no rows below it")
     raw = _by_width(table) if columns is None and table.names is None else _by_name(table, columns)
-    turning = raw.gyro if gyro is None else _parse_gyro(table, gyro)
+    turning = raw.gyro
+    if gyro is not None:
+        words = [gyro] if isinstance(gyro, str) else list(gyro)
+        turning = None if [word.lower() for word in words] == [NONE] else parse_triple(table, words, "--gyro")
     clock = None if raw.time in (turning or ()) else raw.time
     if time is not None:
         clock = None if time.lower() == NONE else find_column(table, time, "--time")
@@ -283,10 +286,8 @@ class Roles:
 def recognise(names: Sequence[str]) -> Roles:
     """Give every column its role by its name."""
     roles = Roles()
-    output: Group = {}
-    spread: Group = {}
-    reference: Group = {}
-    gyro: Group = {}
+    groups: tuple[Group, Group, Group, Group] = ({}, {}, {}, {})
+    output, spread, reference, gyro = groups
     for column, name in enumerate(names):
         words = tokens_of(name)
         key = "".join(words)
@@ -431,11 +432,6 @@ def _by_width(table: Table) -> RawColumns:
         "with --columns, as in --columns 1,2,3"
     )
     return RawColumns(output, names, gyro, time, guessed=time is not None, doubtful=doubtful, notes=(note,))
-
-
-def _parse_gyro(table: Table, gyro: Sequence[str]) -> Triple | None:
-    words = [gyro] if isinstance(gyro, str) else list(gyro)
-    return None if [word.lower() for word in words] == [NONE] else parse_triple(table, words, "--gyro")
 
 
 def _role(name: str, key: str) -> str | None:

@@ -297,18 +297,16 @@ class _FleetCollector:
                 self._add(codes, output, count, scatter)
             else:
                 means.add(list(zip(codes.tolist(), rows.texts[-1], strict=True)), output, count, scatter)
-        where = table.where
         if means is not None:
             codes = np.array([code for code, _ in means.index], dtype=np.intp)
             self._add(codes, means.mean, means.count(), means.scatter())
-            where = _by_label([label for _, label in means.index])
         self.origins.append(
             TableOrigin(
                 table.name,
                 table.sha256,
                 columns.names,
                 first,
-                where,
+                table.where if means is None else _by_label([label for _, label in means.index]),
                 columns.notes if columns.temperature is None else (*columns.notes, COLD),
                 rows=means is None,
                 timed=columns.time is not None,

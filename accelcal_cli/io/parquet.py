@@ -55,8 +55,7 @@ class ParquetTable:
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns."""
         wanted = dict.fromkeys(self.names[k] for k in (*selection.numbers, *selection.texts))
-        for _, rows in self._read(selection, list(wanted)):
-            yield rows
+        return (rows for _, rows in self._read(selection, list(wanted)))
 
     def pairs(self, selection: Selection) -> Iterator[tuple[pl.DataFrame, RowBlock]]:
         """Read blocks of all columns, each with the selected columns of its rows."""
@@ -108,9 +107,7 @@ class ParquetTable:
             return lazy.slice(start, ROWS).collect()
 
     def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
-        bad = ~(np.abs(numbers) <= LIMIT)
-        if gaps:
-            bad &= ~np.isnan(numbers)
+        bad = ~(np.abs(numbers) <= LIMIT) & ~(np.isnan(numbers) & gaps)
         if bad.any():
             row = int(np.argmax(bad))
             value = numbers[row]

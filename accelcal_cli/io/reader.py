@@ -125,8 +125,7 @@ class TextTable:
 
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns; short inputs never import polars."""
-        for _, rows in self.pairs(selection):
-            yield rows
+        return (rows for _, rows in self.pairs(selection))
 
     def pairs(self, selection: Selection) -> Iterator[tuple[bytes, RowBlock]]:
         """Read blocks of whole lines, each with the selected columns of its rows."""
@@ -269,24 +268,19 @@ class FastParser:
     def _bare(self, block: bytes) -> bytes | None:
         """Return the block as it is, where every column is read as a number, so that nothing odd can hide."""
         dialect, selection = self.careful.dialect, self.careful.selection
-        if len(set(selection.numbers)) < dialect.width or selection.texts:
-            return None
+        partial = len(set(selection.numbers)) < dialect.width or selection.texts
         doubtful = dialect.decimal_comma or not block.endswith(b"\n") or has_outer_blank_line(block)
-        return None if doubtful else block
+        return None if partial or doubtful else block
 
     def _plain(self, block: bytes) -> bytes | None:
         """Return the block with one-byte separators only, None if it needs care."""
-        dialect = self.careful.dialect
-        if b"#" in block or b"\0" in block or not block.endswith(b"\n"):
+        dialect, selection = self.careful.dialect, self.careful.selection
+        twice = not set(selection.texts).isdisjoint(selection.numbers)
+        comma = dialect.decimal_comma and (b"." in block or dialect.separator == ",")
+        odd = b"#" in block or b"\0" in block or not block.endswith(b"\n")
+        if twice or comma or odd or not (block.isascii() or _is_utf8(block)):
             return None
-        if not set(self.careful.selection.texts).isdisjoint(self.careful.selection.numbers):
-            return None
-        if dialect.decimal_comma and (b"." in block or dialect.separator == ","):
-            return None
-        if not block.isascii() and not _is_utf8(block):
-            return None
-        if b"\r" in block:
-            block = block.replace(b"\r\n", b"\n")
+        block = block.replace(b"\r\n", b"\n")
         squeezed = _squeeze(block, dialect.separator)
         if b'"' in block and (dialect.separator == " " or squeezed != block):
             return None  # blanks within quotes belong to the cell
@@ -329,9 +323,11 @@ class FastParser:
             return None
         if quoted and _count(block, "\n") != len(frame):
             return None  # a cell goes on over the end of its line
-        if frame[str(dialect.width - 1)].null_count():  # an empty last cell, or a row that is short
-            short = quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
-            return None if short else frame
+        # A null in the last column is an empty cell, or a row that is short.
+        if frame[str(dialect.width - 1)].null_count() and (
+            quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
+        ):
+            return None
         return frame
 
 

@@ -123,8 +123,10 @@ class Readings:
         cautions: tuple[str, ...] | None = None,
     ) -> Self:
         """Return the same poses as those of another input, with its cautions if stated."""
-        own = self.cautions if cautions is None else cautions
-        return replace(self, sha256=sha256, columns=columns, notes=tuple(notes), cautions=own, _line=where)
+        cautions = self.cautions if cautions is None else cautions
+        return replace(
+            self, sha256=sha256, columns=columns, notes=tuple(notes), cautions=cautions, _line=where
+        )
 
 
 def read_readings(

@@ -85,13 +85,11 @@ class _LineWriter:
 
     def _plain(self, block: bytes, rows: int, end: bytes) -> bool:
         """Return whether to try polars: past the header, one kind of line ends, no blank line that it would drop."""
-        if len(block) < SMALL or self.quoted or not self.titled or self.line < self.dialect.header_line:
-            return False
-        if not block.endswith(end) or has_outer_blank_line(block):
-            return False
-        if end == b"\r\n" and not block.count(end) == block.count(b"\r") == block.count(b"\n"):
-            return False
-        return not self.change.places or self._regular(block, rows)
+        past_header = self.titled and self.line >= self.dialect.header_line
+        one_end = end == b"\n" or block.count(end) == block.count(b"\r") == block.count(b"\n")
+        whole = one_end and block.endswith(end) and not has_outer_blank_line(block)
+        regular = not self.change.places or self._regular(block, rows)
+        return len(block) >= SMALL and not self.quoted and past_header and whole and regular
 
     def _regular(self, block: bytes, rows: int) -> bool:
         """Return whether only separators divide the cells, as many on every line, with none left at its end."""

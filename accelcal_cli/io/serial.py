@@ -52,8 +52,13 @@ def _lines(port: Serial, name: str, timeout: float) -> Iterator[bytes]:
     with port:
         rest, started = b"", False
         while True:
-            rest += _received(port, name, timeout)
-            *lines, rest = rest.replace(b"\r", b"\n").split(b"\n")
+            try:
+                chunk: bytes = port.read(max(1, port.in_waiting))
+            except OSError:
+                raise DataError(f"{name}: the port is gone") from None
+            if not chunk:
+                raise DataError(f"{name}: no data for {timeout:g} s")
+            *lines, rest = (rest + chunk).replace(b"\r", b"\n").split(b"\n")
             if len(rest) > LONGEST:
                 raise DataError(
                     f"{name}: {LONGEST} bytes without a line end; is --baud {port.baudrate} right?"
@@ -72,16 +77,6 @@ def _open(name: str, baud: int, timeout: float) -> Serial:
     except (OSError, ValueError) as error:  # a SerialException is an OSError
         reason = str(error).rpartition("]")[2].strip() or str(error)
         raise DataError(f"{name}: cannot be opened: {reason.lower()}") from None
-
-
-def _received(port: Serial, name: str, timeout: float) -> bytes:
-    try:
-        chunk: bytes = port.read(max(1, port.in_waiting))
-    except OSError:
-        raise DataError(f"{name}: the port is gone") from None
-    if not chunk:
-        raise DataError(f"{name}: no data for {timeout:g} s")
-    return chunk
 
 
 def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Iterator[Float]:

@@ -19,7 +19,7 @@ ROWS = RowLengths(tile=10, width=10, still=None, least=100, trim=50)
 
 def tiled(numbers, sizes=(4096,), *, gyro=True, timed=True, size=10, envelope=None):
     tiles = Tiles(size, gyro, timed)
-    for raw in in_blocks(numbers, sizes, gyro=gyro, timed=timed):
+    for raw in in_blocks(numbers, sizes):
         tiles.add(raw, envelope)
     return tiles
 

@@ -14,9 +14,9 @@ A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]
 
 
 def read(log):
-    parts = [(raw.numbers, raw.time) for raw in log.blocks()]
+    rows = np.concatenate(list(log.blocks()))
     log.close()
-    return np.concatenate([numbers for numbers, _ in parts])
+    return rows
 
 
 @pytest.mark.parametrize(

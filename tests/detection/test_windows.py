@@ -39,7 +39,7 @@ def late(row, seconds):
 
 def found(numbers, sizes=(4096,)):
     tiles = Tiles(ROWS.tile, gyro=False, timed=True, longest=longest_step(Clock(100.0), ROWS))
-    for raw in in_blocks(numbers, sizes, gyro=False):
+    for raw in in_blocks(numbers, sizes):
         tiles.add(raw)
     (seen,) = find_intervals(tiles, ROWS, find_level(tiles, ROWS, "log"), (4.0,))
     return seen.intervals, tiles.gaps
