@@ -77,7 +77,7 @@ def command(
     try:
         found = detecting.find_poses(data, columns, chosen, local_g, picture=plot is not None)
     except TooFewPosesError as failure:
-        _draw(failure.found, plot, quiet)
+        _draw(failure.detection, plot, quiet)
         raise
     _show(found, format, output, plot, quiet)
 
