@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import process as pipes
+from accelcal_cli.cli import options, process
 from accelcal_cli.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
@@ -26,38 +26,63 @@ NAMED = 5
 """Sensors that a line on standard error names."""
 
 
+in_model = options.panel("Model")
+
+
+@dataclass(frozen=True)
+class FleetOptions:
+    """What a fleet lets be chosen of the model; keys of the settings."""
+
+    gauge: Annotated[
+        str | None,
+        in_model(
+            help="Which of the equivalent matrices: {choices}.",
+            show_default="lower",
+            autocompletion=options.one_of(options.GAUGES[:-1]),
+        ),
+    ] = None
+    weights: Annotated[
+        str | None,
+        in_model(
+            help="Weight of each pose: {choices}.",
+            show_default="none",
+            autocompletion=options.one_of(options.WEIGHTS[:-1]),
+        ),
+    ] = None
+
+
 def command(
+    *,
     data: Annotated[
         list[str],
         typer.Argument(
-            help="Table of static readings with a column that labels the sensor, or one file a sensor; CSV, text or "
-            "Parquet; - is standard input."
+            help="Table of static readings with a column that labels the sensor, or one file per sensor; CSV, text or "
+            "Parquet; - is standard input.",
+            rich_help_panel="Input",
         ),
     ],
     sensor_column: Annotated[
         str | None,
-        typer.Option(
+        options.in_input(
             help="Column that labels the sensor: name, or number from 1.", show_default="found by name"
         ),
     ] = None,
     columns: options.Columns = None,
-    g: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file: box, nominal, gauge, weights, g.")] = None,
-    gauge: Annotated[
-        str | None, typer.Option(help="lower, upper or symmetric.", show_default="lower")
+    gravity: options.GravityOptions,
+    config: Annotated[
+        Path | None, options.in_input(help="YAML file: box, nominal, gauge, weights, g.")
     ] = None,
-    weights: Annotated[
-        str | None, typer.Option(help="Weight of a pose: none, n or sd.", show_default="none")
-    ] = None,
+    model: FleetOptions,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="Exit 1 when the rms of |f| - g of a sensor is above this (m/s^2)."),
+        options.in_output(
+            help="Exit 1 when the rms of |f| - g of a sensor is above this (m/s^2).",
+            callback=options.check_tolerance,
+        ),
     ] = None,
     output: Annotated[
         str | None,
-        typer.Option(
+        options.in_output(
             "--output",
             "-o",
             help="Table of all sensors, .csv, .parquet or .json; or a folder, ending in /, for a result file of each.",
@@ -77,18 +102,18 @@ def command(
     from accelcal_cli.io.fleet import read_fleet
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
-    options.check_format(format)
     for source in data:
         options.check_input(source)
-    options.check_tolerance(tolerance)
     options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
-    stated_g = options.gravity(g, latitude, height)
-    stated: dict[str, Any] = {"g": stated_g, "gauge": gauge, "weights": weights}
+    stated_g = gravity.stated()
+    stated: dict[str, Any] = options.stated_options(model)
+    if stated_g is not None:
+        stated["g"] = stated_g
     filed = {} if config is None else load_mapping(config)
     if "optimizer" not in filed:
         stated["optimizer"] = "levenberg-marquardt"
-    settings = load_settings(config, {k: v for k, v in stated.items() if v is not None})
+    settings = load_settings(config, stated)
     if filed.get("temperature") is True:  # the default asks for nothing, a file does
         raise ConfigError(
             f"{config}: temperature: true: a fleet goes without slopes; calibrate this sensor by itself"
@@ -99,13 +124,14 @@ def command(
         fleet = _with_results(readings, settings, output)
     else:
         fleet = calibrate_fleet(readings, settings)
-    with pipes.even_if_unread():
+    with process.even_if_unread():
         _show(fleet, readings, settings, format, None if folder else output)
     bad = _bad(fleet, tolerance)
-    with pipes.even_if_unread(sys.stderr):
-        if not quiet:
-            assumed = stated_g is None and settings.g == STANDARD_GRAVITY
-            _tell(readings, output, settings.g if assumed else None)
+    with process.even_if_unread(sys.stderr):
+        options.tell(dict.fromkeys(note for origin in readings.origins for note in origin.notes), quiet)
+        if stated_g is None and settings.g == STANDARD_GRAVITY:
+            options.tell_assumed_gravity(settings.g, quiet)
+        options.tell_written([output], quiet)
         _name(bad, readings.sensors)
     if any(which.any() for which in bad.values()):
         raise typer.Exit(BAD_VERDICT)
@@ -145,8 +171,8 @@ def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.views import fleet as fleet_tables
 
-    found = standouts(fleet, settings.g)
-    rows = fleet_tables.sensors(fleet, readings.sensors, found)
+    outlying = standouts(fleet, settings.g)
+    rows = fleet_tables.sensors(fleet, readings.sensors, outlying)
     if output is not None:
         shown.write_table(rows, output)
     if format == "json":
@@ -154,22 +180,8 @@ def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
-        tables = fleet_tables.summary(fleet, readings.sensors, found, settings.g)
+        tables = fleet_tables.summary(fleet, readings.sensors, outlying, settings.g)
         shown.show_fleet(fleet_tables.counts(fleet), tables)
-
-
-def _tell(readings: FleetReadings, output: str | None, assumed: float | None) -> None:
-    """Say on standard error what was read, assumed and written."""
-    notes = list(dict.fromkeys(note for origin in readings.origins for note in origin.notes))
-    if assumed is not None:
-        notes.append(
-            f"g = {assumed} assumed; state yours with --g or --latitude and --height "
-            "(scale factors are proportional to it)"
-        )
-    if output is not None:
-        notes.append(f"wrote {output}")
-    for note in notes:
-        typer.echo(f"accelcal: {note}", err=True)
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:
@@ -187,4 +199,4 @@ def _name(bad: Mapping[str, Bool], labels: Sequence[str]) -> None:
         if names:
             more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
             count = f"{len(names):,} of {len(labels):,} sensors"
-            typer.echo(f"accelcal: {count} {what}: {', '.join(names[:NAMED])}{more}", err=True)
+            options.tell([f"{count} {what}: {', '.join(names[:NAMED])}{more}"])

@@ -12,24 +12,29 @@ from accelcal_cli.cli import options
 
 def command(
     name: Annotated[
-        str | None, typer.Argument(help="One optimizer: its settings and what they mean.", show_default="all")
+        str | None,
+        typer.Argument(
+            help="One optimizer: its settings and what they mean.",
+            show_default="all",
+            rich_help_panel="Input",
+            autocompletion=options.one_of(options.optimizers),
+        ),
     ] = None,
     format: options.Format = "table",
     quiet: options.Quiet = False,  # noqa: ARG001  # every command takes it; this one never says more than it lists
 ) -> None:
     """List the optimizers, their settings and their papers."""
-    from accelcal_cli.output import console as show
+    from accelcal_cli.output import console
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.views.optimizers import catalogue, settings
 
-    options.check_format(format)
     table = settings(name) if name else catalogue()
     if format == "json":
         sys.stdout.write(json_text(json_rows([table])))
     elif format == "csv":
-        write_csv(show.flat(table), sys.stdout)
+        write_csv(console.flat(table), sys.stdout)
     elif name:
-        show.show_settings(table)
+        console.show_settings(table)
     else:
-        show.show_catalogue(table)
+        console.show_catalogue(table)
     sys.stdout.flush()
