@@ -342,9 +342,15 @@ VERIFY = {
 
 EXPORT = {
     "no format": (["result.yaml"], ["--to"]),
-    "unknown format": (["result.yaml", "--to", "px44"], ['export format "px44"', 'did you mean "px4"', "c-header"]),
+    "unknown format": (
+        ["result.yaml", "--to", "px44"],
+        ['export format "px44"', 'did you mean "px4"', "c-header"],
+    ),
     "counts": (["result.yaml", "--to", "px4"], ["--to px4", "output units", "--driver-scale"]),
-    "driver scale": (["result.yaml", "--to", "px4", "--driver-scale", "0"], ["--to px4: driver_scale: 0", "more than 0"]),
+    "driver scale": (
+        ["result.yaml", "--to", "px4", "--driver-scale", "0"],
+        ["--to px4: driver_scale: 0", "more than 0"],
+    ),
     "instance": (
         ["result.yaml", "--to", "px4", "--instance", "9", "--driver-scale", "1"],
         ["--to px4: instance: 9", "at most 3"],
@@ -357,7 +363,10 @@ EXPORT = {
         ["result.yaml", "--to", "numpy", "--instance", "0", "-o", "a.npz"],
         ["--instance does not apply to --to numpy"],
     ),
-    "negative instance": (["result.yaml", "--to", "px4", "--instance", "-1"], ["--to px4: instance: -1", "at least 0"]),
+    "negative instance": (
+        ["result.yaml", "--to", "px4", "--instance", "-1"],
+        ["--to px4: instance: -1", "at least 0"],
+    ),
     "no folder": (["result.yaml", "--to", "ros", "-o", "no/out.yaml"], ["no/out.yaml", "no such folder"]),
 }
 
