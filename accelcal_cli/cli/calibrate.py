@@ -145,7 +145,7 @@ def command(
     stated_g = gravity.stated()
     detection = options.stated_options(log)
     if detection and not raw:
-        raise UsageError(f"--{next(iter(detection)).replace('_', '-')} goes with --raw only")
+        raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
     stated = {**options.stated_options(model), **options.stated_options(search)}
     if stated_g is not None:
         stated["g"] = stated_g

@@ -95,7 +95,7 @@ def command(
     from accelcal_cli.sensor.simulation import Handling, handled, simulate, simulate_fleet
 
     if raw and sensors is not None:
-        raise UsageError("--sensors does not go with --raw")
+        raise UsageError("--sensors cannot be used with --raw")
     if positions * samples * (sensors or 1) > MOST_SAMPLES:
         many = "" if sensors is None else f" and --sensors {sensors}"
         raise UsageError(
@@ -134,9 +134,9 @@ def command(
 
 def _check_raw(raw: bool, stated: list[str], samples: int, attitude: bool) -> None:
     if not raw and stated:
-        raise UsageError(f"--{stated[0]} goes with --raw only")
+        raise UsageError(f"--{stated[0]} needs --raw")
     if raw and (samples > 1 or attitude):
-        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'} does not go with --raw")
+        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'} cannot be used with --raw")
 
 
 def _header(file: IO[str], first: list[str], labelled: bool, attitude: bool) -> None:
