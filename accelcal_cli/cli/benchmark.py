@@ -112,15 +112,10 @@ def command(
 
 
 def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.studies.benchmark import curves, summary
 
     rows = summary(study, records)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show_benchmark
         from accelcal_cli.studies.benchmark import rank, table
 

@@ -143,12 +143,10 @@ def command(
     options.check_apart([data, config], {"-o": output})
     _check_output(output, format)
     stated_g = gravity.stated()
-    detection = options.stated_options(log)
+    detection = options.stated(**vars(log))
     if detection and not raw:
         raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
-    stated = {**options.stated_options(model), **options.stated_options(search)}
-    if stated_g is not None:
-        stated["g"] = stated_g
+    stated = options.stated(**vars(model), **vars(search), g=stated_g)
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)
     if raw:
@@ -207,24 +205,19 @@ def _check_output(output: str | None, format: str) -> None:
 
 def _show(result: Calibration, format: str, output: str | None) -> None:
     """Write the result file, then print the result in the chosen form."""
-    from accelcal_cli.output.machine import json_text, write_csv
-
     if output is not None:
         from accelcal_cli.config import dump
         from accelcal_cli.output.files import whole_file
+        from accelcal_cli.output.machine import json_text
 
         text = json_text(result.record()) if output.endswith(".json") else dump(result.record())
         with whole_file(output, binary=True) as file:  # read back as UTF-8, whatever the terminal takes
             file.write(text.encode())
         if output == "-":
             return
-    if format == "json":
-        sys.stdout.write(json_text(result.record()))
-    elif format == "csv":
-        from accelcal_cli.views.calibration import values
+    from accelcal_cli.views.calibration import values
 
-        write_csv(values(result), sys.stdout)
-    else:
+    if not options.print_data(format, result.record, lambda: values(result)):
         from accelcal_cli.output.console import show_calibration
 
         show_calibration(result)

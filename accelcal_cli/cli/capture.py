@@ -70,9 +70,9 @@ def command(
 ) -> None:
     """Take poses from a live sensor, guided.
 
-    Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged;
-    each is one row of the table for accelcal calibrate, written when it is taken. Ctrl-C, a closed terminal, the end
-    of the input and a lost port end it early; the poses taken until then are there. Exit code 1 means that the input
+    Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged into
+    one row of the table for accelcal calibrate, written at once. Ctrl-C, a closed terminal, the end of the input and a
+    lost port end it early; the poses taken until then are kept. Exit code 1 means that the input
     ended before all poses were taken.
     """
     from accelcal_cli.output.files import check_target, is_stream
@@ -183,11 +183,11 @@ def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) 
             file.save(capture.taken, last=True)
         except OutputError as error:
             ending = error
-    kept = _kept(capture, file)
+    summary = _summary(capture, file)
     if ending is not None:
-        ending.args = (f"{ending}; {kept}",)
+        ending.args = (f"{ending}; {summary}",)
         raise ending
-    options.tell([kept], quiet)
+    options.tell([summary], quiet)
     if capture.missing():
         raise typer.Exit(INCOMPLETE)
 
@@ -205,7 +205,7 @@ def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Wa
             return
 
 
-def _kept(capture: Capture, file: PoseFile) -> str:
+def _summary(capture: Capture, file: PoseFile) -> str:
     """Return what to say of the poses that are written."""
     if not file.kept:
         parts = ["no pose was taken"] * (not capture.taken) + ["nothing is written"] * (not file.flows)

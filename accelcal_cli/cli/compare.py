@@ -187,7 +187,7 @@ def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOp
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.studies.scenarios import Recording
 
-    stated = [f"--{name}" for name, value in options.stated_options(simulation).items() if value is not False]
+    stated = [f"--{name}" for name, value in options.stated(**vars(simulation)).items() if value is not False]
     if stated:
         raise UsageError(f"{', '.join(stated)}: not with a file of readings, which are not simulated")
     options.check_input(data)
@@ -195,15 +195,10 @@ def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOp
 
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.studies.compare import curves, summary
 
     rows = summary(study, records)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show_study
 
         convergence = curves(study, records)

@@ -79,17 +79,14 @@ def _draw(detection: Detection, plot: str | None, quiet: bool) -> None:
 def _show(detection: Detection, format: str, output: str | None) -> None:
     """Write the poses, then print in the chosen form."""
     from accelcal_cli.output.files import whole_file
-    from accelcal_cli.output.machine import json_text, write_csv
+    from accelcal_cli.output.machine import write_csv
     from accelcal_cli.views.detection import poses_table, record
 
     if output is not None:
         with whole_file(output) as file:
             write_csv(poses_table(detection), file)
-    if format == "json":
-        sys.stdout.write(json_text(record(detection)))
-    elif format == "csv":
-        write_csv(poses_table(detection), sys.stdout)
-    elif output != "-":
+    printed = options.print_data(format, lambda: record(detection), lambda: poses_table(detection))
+    if not printed and output != "-":
         from accelcal_cli.output.console import show_detection
 
         show_detection(detection)

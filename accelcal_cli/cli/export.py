@@ -70,7 +70,7 @@ def command(
     from accelcal_cli.output.files import check_target, whole_file
 
     cls = EXPORTERS.get(to)
-    stated = options.stated_options(target)
+    stated = options.stated(**vars(target))
     for option in stated:
         takers = _takers()[option]
         if to not in takers:

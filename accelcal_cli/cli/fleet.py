@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -29,28 +28,6 @@ NAMED = 5
 in_model = options.panel("Model")
 
 
-@dataclass(frozen=True)
-class FleetOptions:
-    """What a fleet lets be chosen of the model; keys of the settings."""
-
-    gauge: Annotated[
-        str | None,
-        in_model(
-            help="Which of the equivalent matrices: {choices}.",
-            show_default="lower",
-            autocompletion=options.one_of(options.GAUGES[:-1]),
-        ),
-    ] = None
-    weights: Annotated[
-        str | None,
-        in_model(
-            help="Weight of each pose: {choices}.",
-            show_default="none",
-            autocompletion=options.one_of(options.WEIGHTS[:-1]),
-        ),
-    ] = None
-
-
 def command(
     *,
     data: Annotated[
@@ -72,7 +49,22 @@ def command(
     config: Annotated[
         Path | None, options.in_input(help="YAML file: box, nominal, gauge, weights, g.")
     ] = None,
-    model: FleetOptions,
+    gauge: Annotated[
+        str | None,
+        in_model(
+            help="Which of the equivalent matrices: {choices}.",
+            show_default="lower",
+            autocompletion=options.one_of(options.GAUGES[:-1]),
+        ),
+    ] = None,
+    weights: Annotated[
+        str | None,
+        in_model(
+            help="Weight of each pose: {choices}.",
+            show_default="none",
+            autocompletion=options.one_of(options.WEIGHTS[:-1]),
+        ),
+    ] = None,
     tolerance: Annotated[
         float | None,
         options.in_output(
@@ -107,9 +99,7 @@ def command(
     options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
     stated_g = gravity.stated()
-    stated: dict[str, Any] = options.stated_options(model)
-    if stated_g is not None:
-        stated["g"] = stated_g
+    stated = options.stated(g=stated_g, gauge=gauge, weights=weights)
     filed = {} if config is None else load_mapping(config)
     if "optimizer" not in filed:
         stated["optimizer"] = "levenberg-marquardt"
@@ -158,30 +148,25 @@ def _with_results(readings: FleetReadings, settings: Settings, output: str) -> F
     from accelcal_cli.output.console import write_result
     from accelcal_cli.output.files import whole_folder
 
-    with whole_folder(output) as made:
+    with whole_folder(output) as folder:
         return calibrate_fleet(
-            readings, settings, lambda number, result: write_result(made, readings.sensors[number], result)
+            readings, settings, lambda number, result: write_result(folder, readings.sensors[number], result)
         )
 
 
 def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
     from accelcal_cli.calibration.fleet import standouts
-    from accelcal_cli.output import console as shown
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.output import console
     from accelcal_cli.views import fleet as fleet_tables
 
     outlying = standouts(fleet, settings.g)
     rows = fleet_tables.sensors(fleet, readings.sensors, outlying)
     if output is not None:
-        shown.write_table(rows, output)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+        console.write_table(rows, output)
+    if not options.print_rows(format, rows):
         tables = fleet_tables.summary(fleet, readings.sensors, outlying, settings.g)
-        shown.show_fleet(fleet_tables.counts(fleet), tables)
+        console.show_fleet(fleet_tables.counts(fleet), tables)
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:

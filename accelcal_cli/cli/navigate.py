@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,47 +28,6 @@ def filters_or_all() -> list[str]:
     return [*options.filters(), ALL]
 
 
-@dataclass(frozen=True)
-class FilterOptions:
-    """Settings of every filter."""
-
-    particles: Annotated[
-        int | None, in_filters(help="Particles.", min=4, max=1_000_000, show_default="100")
-    ] = None
-    generations: Annotated[
-        int | None, in_filters(help="Generations of the evolution.", min=0, max=1000, show_default="20")
-    ] = None
-
-
-@dataclass(frozen=True)
-class VoyageOptions:
-    """What is sailed through, and how often gravity is measured."""
-
-    map: Annotated[
-        str | None,
-        in_voyage(
-            "--map",
-            help="{choices} (generated), or a file: NetCDF, GeoTIFF, XYZ text.",
-            show_default="rough",
-            autocompletion=options.one_of(MAPS),
-        ),
-    ] = None
-    voyage: Annotated[
-        str | None, in_voyage(help="CSV file of a recorded voyage.", show_default="a planned one")
-    ] = None
-    period: Annotated[float | None, in_voyage(help="Seconds between measurements.", show_default="10")] = None
-
-
-@dataclass(frozen=True)
-class RepeatOptions:
-    """How often the voyage is repeated."""
-
-    runs: Annotated[int | None, running.in_runs(help="Runs.", min=1, max=100_000, show_default="20")] = None
-    seed: Annotated[
-        int | None, running.in_runs(help="Seed of all random numbers.", min=0, show_default="0")
-    ] = None
-
-
 def command(
     *,
     filter: Annotated[
@@ -89,8 +48,27 @@ def command(
             autocompletion=options.one_of(MODES),
         ),
     ] = None,
-    filter_options: FilterOptions,
-    voyage_options: VoyageOptions,
+    particles: Annotated[
+        int | None, in_filters(help="Particles.", min=4, max=1_000_000, show_default="100")
+    ] = None,
+    generations: Annotated[
+        int | None, in_filters(help="Generations of the evolution.", min=0, max=1000, show_default="20")
+    ] = None,
+    map: Annotated[
+        str | None,
+        in_voyage(
+            "--map",
+            help="{choices} (generated), or a file: NetCDF, GeoTIFF, XYZ text.",
+            show_default="rough",
+            autocompletion=options.one_of(MAPS),
+        ),
+    ] = None,
+    voyage: Annotated[
+        str | None, in_voyage(help="CSV file of a recorded voyage.", show_default="a planned one")
+    ] = None,
+    period: Annotated[
+        float | None, in_voyage(help="Seconds between measurements.", show_default="10")
+    ] = None,
     config: Annotated[
         Path | None, in_voyage(help="YAML file: voyage, INS, map, filters and their parameters.")
     ] = None,
@@ -100,7 +78,10 @@ def command(
             help="Result of accelcal calibrate: its bias sigma, beside the INS without it; - is standard input."
         ),
     ] = None,
-    repeats: RepeatOptions,
+    runs: Annotated[int | None, running.in_runs(help="Runs.", min=1, max=100_000, show_default="20")] = None,
+    seed: Annotated[
+        int | None, running.in_runs(help="Seed of all random numbers.", min=0, show_default="0")
+    ] = None,
     output: Annotated[
         str | None,
         options.in_output("--output", "-o", help="CSV file for RMSE against time; - is standard output."),
@@ -119,7 +100,10 @@ def command(
     """
     running.check_plot(plot)
     _check(mode, output, format)
-    study = _study(config, voyage_options, filter or (), mode, filter_options, repeats, calibration)
+    setting = options.stated(map=map, voyage=voyage, period=period)
+    limits = {"particles": particles, "generations": generations}
+    repeats = options.stated(runs=runs, seed=seed)
+    study = _study(config, setting, filter or (), mode, limits, repeats, calibration)
     inputs = [config, calibration, *study.waters.files()]
     options.check_apart(inputs, {"-o": output, "--raw": study_options.raw, "--plot": plot})
     records = study_options.run(study)
@@ -143,11 +127,11 @@ def _check(mode: str | None, output: str | None, format: str) -> None:
 
 def _study(
     config: Path | None,
-    voyage_options: VoyageOptions,
+    setting: Mapping[str, Any],
     names: Sequence[str],
     mode: str | None,
-    filter_options: FilterOptions,
-    repeats: RepeatOptions,
+    limits: Mapping[str, Any],
+    repeats: Mapping[str, Any],
     calibration: str | None,
 ) -> Navigation:
     """Return the study that file and command line state together."""
@@ -155,10 +139,10 @@ def _study(
     from accelcal_cli.schema import build
     from accelcal_cli.studies.entries import words
 
-    waters, own, further = load_waters(config, options.stated_options(voyage_options))
+    waters, own, further = load_waters(config, setting)
     filed: dict[str, Any] = {key: further[key] for key in ("runs", "seed") if key in further}
-    repeated = build(Repeats, {**filed, **options.stated_options(repeats)}, str(config or "command line"))
-    entries = _entries(words(names), own, mode, asdict(filter_options))
+    repeated = build(Repeats, {**filed, **repeats}, str(config or "command line"))
+    entries = _entries(words(names), own, mode, limits)
     grades: tuple[Grade, ...] = (waters.ins,)
     if calibration is not None:
         waters, grades = _calibrated(waters, calibration)
@@ -166,7 +150,7 @@ def _study(
 
 
 def _entries(
-    names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, settings: dict[str, Any]
+    names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, limits: Mapping[str, Any]
 ) -> list[FilterEntry]:
     """Return the filters by name or label, in the modes that were asked for."""
     from accelcal_cli.navigation.study import FilterEntry, filter_names, limited
@@ -177,7 +161,7 @@ def _entries(
         wanted = list(dict.fromkeys([*stated, *filter_names()]))
     chosen = [stated.get(name, FilterEntry(name, name)) for name in wanted]
     modes: list[str | None] = ["default", "literal"] if mode == "both" else [mode]
-    return [limited(entry, {**settings, "mode": each}) for each in modes for entry in chosen]
+    return [limited(entry, {**limits, "mode": each}) for each in modes for entry in chosen]
 
 
 def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]:
@@ -196,15 +180,10 @@ def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]
 
 def _show(study: Navigation, records: Sequence[Record], format: str) -> None:
     """Print the summary in a format."""
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.views.navigation import summary
 
     rows = summary(study, records)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import console, show_split
 
         show_split(rows, console())

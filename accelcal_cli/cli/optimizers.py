@@ -25,16 +25,10 @@ def command(
 ) -> None:
     """List the optimizers, their settings and their papers."""
     from accelcal_cli.output import console
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.output.machine import json_rows
     from accelcal_cli.views.optimizers import catalogue, settings
 
     table = settings(name) if name else catalogue()
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([table])))
-    elif format == "csv":
-        write_csv(console.flat(table), sys.stdout)
-    elif name:
-        console.show_settings(table)
-    else:
-        console.show_catalogue(table)
+    if not options.print_data(format, lambda: json_rows([table]), lambda: console.flat(table)):
+        (console.show_settings if name else console.show_catalogue)(table)
     sys.stdout.flush()

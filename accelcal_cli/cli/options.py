@@ -28,6 +28,7 @@ from accelcal_cli.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
+    from accelcal_cli.table import Table
 
 Complete = Callable[[str], list[str]]
 """What the shell asks for values: from what is typed so far to what it may become."""
@@ -142,9 +143,8 @@ def expand(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def stated_options(group: Any) -> dict[str, Any]:
-    """Return the options of a group that were stated, by name."""
-    values = {field.name: getattr(group, field.name) for field in dataclasses.fields(group)}
+def stated(**values: Any) -> dict[str, Any]:
+    """Return the options that were stated, by name; those of a group as `**vars(group)`."""
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -443,6 +443,30 @@ def load_result(source: str, data: str | None = None) -> Calibration:
         )
     check_input(source)
     return config.load_result("<stdin>", sys.stdin.buffer)
+
+
+def print_data(format: str, record: Callable[[], object], table: Callable[[], Table]) -> bool:
+    """Print what other programs read; return whether that was asked for, or else a table for people.
+
+    Args:
+        format: of FORMATS.
+        record: makes what json prints.
+        table: makes what csv prints.
+    """
+    from accelcal_cli.output.machine import json_text, write_csv
+
+    if format == "json":
+        sys.stdout.write(json_text(record()))
+    elif format == "csv":
+        write_csv(table(), sys.stdout)
+    return format != "table"
+
+
+def print_rows(format: str, table: Table) -> bool:
+    """Print a table for other programs; return whether that was asked for."""
+    from accelcal_cli.output.machine import json_rows
+
+    return print_data(format, lambda: json_rows([table]), lambda: table)
 
 
 def tell(notes: Iterable[str], quiet: bool = False) -> None:

@@ -127,10 +127,10 @@ def _plan(
     from accelcal_cli.planning.plan import plan
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
-    taken = 0 if so_far is None else so_far.poses
-    count = add or ((poses or FROM_NOTHING) - taken if poses or so_far is None else NEXT)
+    existing = 0 if so_far is None else so_far.poses
+    count = add or ((poses or FROM_NOTHING) - existing if poses or so_far is None else NEXT)
     if count < 1:
-        raise UsageError(f"--poses {poses}: {taken} poses are there already; expected more, or --add")
+        raise UsageError(f"--poses {poses}: {existing} poses exist already; expected more, or --add")
     if count > MOST_POSES:
         raise UsageError(f"--poses {poses}: {count} poses to plan; expected at most {MOST_POSES}")
     local_g = g or STANDARD_GRAVITY
@@ -139,26 +139,22 @@ def _plan(
     known = so_far.s if so_far.freedom > 0 and so_far.s > 0 else None
     sigma = noise or known
     part = None if sigma is None else sigma / so_far.g
-    return plan(so_far.information, taken, count, fixture, part, so_far)
+    return plan(so_far.information, existing, count, fixture, part, so_far)
 
 
 def _show(proposal: Plan, format: str) -> None:
-    from accelcal_cli.output.machine import json_text, write_csv
     from accelcal_cli.planning.plan import parameter_table, pose_table, record
 
-    if format == "json":
-        sys.stdout.write(json_text(record(proposal)))
-    elif format == "csv":
-        write_csv(pose_table(proposal), sys.stdout)
-    else:
-        from accelcal_cli.output import console
+    if options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
+        return
+    from accelcal_cli.output import console
 
-        out = console.console()
-        known = proposal.so_far
-        if known is not None and (known.cautions or proposal.beyond_poses):
-            console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
-            out.print()
-        console.show_split(pose_table(proposal), out)
-        expected = parameter_table(proposal)
-        if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
-            console.show([expected], out)
+    out = console.console()
+    known = proposal.so_far
+    if known is not None and (known.cautions or proposal.beyond_poses):
+        console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
+        out.print()
+    console.show_split(pose_table(proposal), out)
+    expected = parameter_table(proposal)
+    if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
+        console.show([expected], out)

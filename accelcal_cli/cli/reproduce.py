@@ -120,15 +120,9 @@ def _print(name: str, title: str, tables: Sequence[Table], format: str) -> None:
 
 
 def _list(table: Table, format: str, stated: Sequence[object]) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-
     if any(value is not None for value in stated):
         raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([table])))
-    elif format == "csv":
-        write_csv(table, sys.stdout)
-    else:
+    if not options.print_rows(format, table):
         from accelcal_cli.output.console import console, show
 
         show([table], console())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated
@@ -21,24 +20,6 @@ if TYPE_CHECKING:
 MOST_SAMPLES = 100_000_000
 
 in_sensor, in_poses = options.panel("Sensor"), options.panel("Poses")
-
-
-@dataclass(frozen=True)
-class HandlingOptions:
-    """How the sensor of a raw log is handled."""
-
-    rate: Annotated[float | None, options.in_log(help="With --raw: rows per second.", show_default="100")] = (
-        None
-    )
-    hold: Annotated[float | None, options.in_log(help="With --raw: seconds per pose.", show_default="5")] = (
-        None
-    )
-    move: Annotated[float | None, options.in_log(help="With --raw: seconds per move.", show_default="2")] = (
-        None
-    )
-    tremor: Annotated[
-        float | None, options.in_log(help="With --raw: tremor of the hand, m/s^2 rms.", show_default="0")
-    ] = None
 
 
 def command(
@@ -73,7 +54,18 @@ def command(
     raw: Annotated[
         bool, options.in_log("--raw", help="Simulate a raw log: poses held, moves between.")
     ] = False,
-    handling: HandlingOptions,
+    rate: Annotated[
+        float | None, options.in_log(help="With --raw: rows per second.", show_default="100")
+    ] = None,
+    hold: Annotated[
+        float | None, options.in_log(help="With --raw: seconds per pose.", show_default="5")
+    ] = None,
+    move: Annotated[
+        float | None, options.in_log(help="With --raw: seconds per move.", show_default="2")
+    ] = None,
+    tremor: Annotated[
+        float | None, options.in_log(help="With --raw: tremor of the hand, m/s^2 rms.", show_default="0")
+    ] = None,
     gyro: Annotated[bool, options.in_log("--gyro", help="With --raw: add a gyroscope, rad/s.")] = False,
     output: Annotated[str, options.in_output("--output", "-o", help="CSV file; - is standard output.")] = "-",
     truth: Annotated[str | None, options.in_output(help="YAML file for the true parameters.")] = None,
@@ -103,7 +95,7 @@ def command(
         )
     if output == truth:
         raise UsageError(f'--truth "{truth}": expected another file than --output')
-    stated = options.stated_options(handling)
+    stated = options.stated(rate=rate, hold=hold, move=move, tremor=tremor)
     _check_raw(raw, [*stated, *(["gyro"] * gyro)], samples, attitude)
     shipped = not Path(sensor).suffix
     options.check_apart([None if shipped else sensor], {"-o": output, "--truth": truth})

@@ -80,15 +80,9 @@ def _check_gravity(g: float | None, old: Calibration, name: str) -> None:
 
 
 def _show(verification: Verification, format: str) -> None:
-    from accelcal_cli.output.machine import json_text, write_csv
+    from accelcal_cli.views.verification import differences
 
-    if format == "json":
-        sys.stdout.write(json_text(verification.record()))
-    elif format == "csv":
-        from accelcal_cli.views.verification import differences
-
-        write_csv(differences(verification), sys.stdout)
-    else:
+    if not options.print_data(format, verification.record, lambda: differences(verification)):
         from accelcal_cli.output.console import show_verification
 
         show_verification(verification)

@@ -65,7 +65,7 @@ def test_a_group_stands_for_its_options():
     assert spelled.__doc__ == "Do it."
     spelled(name="a", latitude=3.0, height=0.0, loud=True)
     assert calls == [("a", Place(3.0), True)]
-    assert options.stated_options(Place(3.0)) == {"latitude": 3.0, "height": 0.0}
+    assert options.stated(**vars(Place(3.0))) == {"latitude": 3.0, "height": 0.0}
 
 
 def test_the_last_of_several_names_is_completed():
