@@ -14,6 +14,7 @@ import yaml
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, did_you_mean
+from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.schema import build
 
 if TYPE_CHECKING:
@@ -154,11 +155,14 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
 
 
 def shipped_parameters(optimizer: Any) -> dict[str, Any]:
-    """Return the settings that the shipped file of an optimizer states; none for an unknown one."""
-    files = shipped("optimizers")
-    if not isinstance(optimizer, str) or optimizer not in files:
+    """Return the settings that an optimizer's YAML file states; none for an unknown optimizer.
+
+    The file is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
+    """
+    if not isinstance(optimizer, str):
         return {}
-    parameters: dict[str, Any] = load_mapping(files[optimizer]).get("parameters") or {}
+    path = shipped("optimizers").get(optimizer) or OPTIMIZERS.beside(optimizer, ".yaml")
+    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
     return parameters
 
 

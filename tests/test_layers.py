@@ -22,7 +22,17 @@ def test_every_import_goes_downward():
 def test_every_unit_has_a_layer():
     units = {layers.unit_of(path, ROOT) for path in ROOT.rglob("*.py")}
     assert units - set(layers.FRONT) - set(layers.RANK) == set()
-    assert {"errors", "optimization", "sensor", "io", "calibration", "config", "views", "output", "cli"} <= units
+    assert {
+        "errors",
+        "optimization",
+        "sensor",
+        "io",
+        "calibration",
+        "config",
+        "views",
+        "output",
+        "cli",
+    } <= units
 
 
 def test_the_library_neither_prints_nor_exits_nor_shares_random_numbers():

@@ -61,7 +61,7 @@ class Filter(ABC):
         """Return the filter's track; run r of the streams belongs to run r of the scenario."""
 
 
-FILTERS: Registry[Filter] = Registry("accelcal_cli.navigation.filters", "filter")
+FILTERS: Registry[Filter] = Registry(Filter, "accelcal_cli.navigation.filters", "filter", "accelcal.filters")
 
 UNSEEN = -1e5
 """Greatest log-likelihood of a cloud of which no particle is on the map: above OUTSIDE, below any misfit on it."""

@@ -93,4 +93,6 @@ class Optimizer(ABC):
         """Return the State after one iteration of all R runs."""
 
 
-OPTIMIZERS: Registry[Optimizer] = Registry("accelcal_cli.optimization.algorithms", "optimizer")
+OPTIMIZERS: Registry[Optimizer] = Registry(
+    Optimizer, "accelcal_cli.optimization.algorithms", "optimizer", "accelcal.optimizers"
+)
