@@ -18,6 +18,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -363,14 +364,16 @@ def test_commands_print_what_they_printed(name, folder, monkeypatch):
     path = GOLDEN / f"{name}.txt"
     if RENEW:
         path.write_text(text)
-    expected, actual = sections(path.read_text()), sections(text)
-    for was, now in zip(expected, actual, strict=True):
+    differences = []
+    for was, now in zip(sections(path.read_text()), sections(text), strict=True):
         # Numbers that the poses do not determine are no contract.
         zero = math.inf if UNDETERMINED.search("\n".join(was)) else ZERO.get(name, 1e-12)
-        for a, b in zip(was, now, strict=False):
-            near = math.inf if ",undetermined," in a else zero
-            assert same(a, b, near), f"{path.name}, {was[0]}\nwas: {a}\nnow: {b}"
-        assert len(was) == len(now), f"{path.name}, {was[0]}\nwas: {was[len(now) :]}\nnow: {now[len(was) :]}"
+        differences += [
+            f"{was[0]}\nwas: {a}\nnow: {b}"
+            for a, b in zip_longest(was, now, fillvalue="(nothing)")
+            if not same(a, b, math.inf if ",undetermined," in a else zero)
+        ]
+    assert not differences, f"{path.name}: {len(differences)} lines differ\n" + "\n".join(differences[:20])
 
 
 def test_the_comparison_sees_a_word_and_a_number():
