@@ -18,7 +18,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable
-from itertools import zip_longest
+from difflib import SequenceMatcher
 from pathlib import Path
 
 import pytest
@@ -336,6 +336,22 @@ def sections(text: str) -> list[list[str]]:
     return [part.splitlines() for part in re.split(r"(?m)^(?=\$ )", text) if part]
 
 
+def compared(was: list[str], now: list[str], zero: float) -> list[str]:
+    """What the lines of a command differ in; lines that are new or gone do not make those after them differ."""
+    words = [[" ".join(NUMBER.sub("#", line).split()) for line in part] for part in (was, now)]
+    differences = []
+    for tag, i, k, j, m in SequenceMatcher(None, *words, autojunk=False).get_opcodes():
+        if tag != "equal":
+            differences.append(
+                "\n".join([was[0], *(f"- {a}" for a in was[i:k]), *(f"+ {b}" for b in now[j:m])])
+            )
+            continue
+        for a, b in zip(was[i:k], now[j:m], strict=True):
+            if not same(a, b, math.inf if ",undetermined," in a else zero):
+                differences.append(f"{was[0]}\n- {a}\n+ {b}")
+    return differences
+
+
 def same(expected: str, actual: str, zero: float = 1e-12) -> bool:
     """Whether two lines have the same words, and numbers that differ by rounding, or by `zero`, only."""
     if NUMBER.sub("#", expected).split() != NUMBER.sub("#", actual).split():
@@ -364,16 +380,12 @@ def test_commands_print_what_they_printed(name, folder, monkeypatch):
     path = GOLDEN / f"{name}.txt"
     if RENEW:
         path.write_text(text)
-    differences = []
+    differences: list[str] = []
     for was, now in zip(sections(path.read_text()), sections(text), strict=True):
         # Numbers that the poses do not determine are no contract.
         zero = math.inf if UNDETERMINED.search("\n".join(was)) else ZERO.get(name, 1e-12)
-        differences += [
-            f"{was[0]}\nwas: {a}\nnow: {b}"
-            for a, b in zip_longest(was, now, fillvalue="(nothing)")
-            if not same(a, b, math.inf if ",undetermined," in a else zero)
-        ]
-    assert not differences, f"{path.name}: {len(differences)} lines differ\n" + "\n".join(differences[:20])
+        differences += compared(was, now, zero)
+    assert not differences, f"{path.name}: {len(differences)} differences\n" + "\n".join(differences[:20])
 
 
 def test_the_comparison_sees_a_word_and_a_number():
