@@ -154,14 +154,17 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
     return settings
 
 
-def shipped_parameters(optimizer: Any) -> dict[str, Any]:
-    """Return the settings that an optimizer's YAML file states; none for an unknown optimizer.
+def optimizer_file(name: str) -> Path | None:
+    """Return the YAML file of an optimizer, None where there is none.
 
-    The file is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
+    That is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
     """
-    if not isinstance(optimizer, str):
-        return {}
-    path = shipped("optimizers").get(optimizer) or OPTIMIZERS.beside(optimizer, ".yaml")
+    return shipped("optimizers").get(name) or OPTIMIZERS.beside(name, ".yaml")
+
+
+def shipped_parameters(optimizer: Any) -> dict[str, Any]:
+    """Return the settings that the file of an optimizer states; none for an unknown one."""
+    path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
     parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
     return parameters
 

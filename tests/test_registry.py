@@ -284,7 +284,7 @@ def test_a_broken_package_says_so_in_one_line_and_only_where_it_is_used(installe
         assert "\n" not in str(error.value)
     assert things.names() == ["good"]
     assert things.faults == {"grey-thing": str(error.value)}
-    with pytest.raises(ConfigError, match='unknown thing "grey"; known: good$'):
+    with pytest.raises(ConfigError, match=r'unknown thing "grey"; known: good$'):
         things.get("grey")
 
 

@@ -19,7 +19,8 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.minimize import Status, Stopping, minimize
+from accelcal_cli.optimization.minimize import Stopping, minimize
+from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.studies.functions import TestFunction
 from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of
 from accelcal_cli.table import Column, Table

@@ -60,8 +60,8 @@ def choose(names: Sequence[str], config: Path | None, default: Sequence[str], bu
 
 
 def _shipped(name: str, stated: Iterable[str]) -> Entry:
-    known = {*OPTIMIZERS.names(), *stated}
-    if name not in known:
+    if OPTIMIZERS.find(name) is None:
+        known = {*OPTIMIZERS.names(), *stated}
         raise ConfigError(
             f'unknown optimizer "{name}"{did_you_mean(name, known)}; known: {", ".join(sorted(known))}'
         )

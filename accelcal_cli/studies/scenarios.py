@@ -18,6 +18,7 @@ from accelcal_cli.calibration.box import SHIFT, half_widths
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.observability import information
 from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress_each, fit_ellipsoid, pack
+from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import packed, polish
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.errors import ConfigError, DataError
@@ -87,7 +88,7 @@ class Recording:
                 f"{readings.source}: there is no one least cost to compare with; accelcal calibrate calls these "
                 f"readings undetermined ({found.reasons[0].rstrip('.')})"
             )
-        triangle = packed(readings, None)
+        triangle = packed(Sample.of([readings]), None)
         return cls(
             readings.source,
             readings.sha256,

@@ -19,7 +19,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.optimization.minimize import Run
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.table import Column, Table
 
 TRACE_POINTS = 100
@@ -42,7 +42,7 @@ class Entry:
     optimizer: str
     parameters: dict[str, Any]
 
-    def build(self) -> Optimizer:
+    def build(self) -> Optimizer[State]:
         """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
         return OPTIMIZERS.build(self.optimizer, self.parameters, f"{self.label}")
 
