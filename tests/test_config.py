@@ -53,7 +53,7 @@ def test_a_file_or_standard_input_is_read(tmp_path):
     file.write_bytes(b"a: \xff\n")
     with pytest.raises(ConfigError, match=r"a.yaml: not UTF-8 text \(byte 3\)"):
         load_mapping(file)
-    with pytest.raises(ConfigError, match="none.yaml: no such file or directory"):
+    with pytest.raises(ConfigError, match=r"none.yaml: no such file or directory"):
         load_mapping(tmp_path / "none.yaml")
 
 

@@ -110,12 +110,13 @@ def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
-        from accelcal_cli.output.console import show_benchmark
+        from accelcal_cli.output.console import show
         from accelcal_cli.studies import benchmark as ranks
+        from accelcal_cli.views.blocks import benchmark
 
         ranking = ranks.rank(study, records)
         further = [ranks.table(ranking)] if ranking else []
-        show_benchmark(study.title, rows, curves(study, records), study.tolerance, further)
+        show(benchmark(study.title, rows, curves(study, records), study.tolerance, further))
     sys.stdout.flush()
 
 

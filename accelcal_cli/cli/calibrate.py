@@ -216,6 +216,7 @@ def _show(result: Calibration, format: str, output: str | None) -> None:
 
         write_csv(values(result), sys.stdout)
     else:
-        from accelcal_cli.output.console import show_calibration
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.calibration import blocks
 
-        show_calibration(result)
+        show(blocks(result))

@@ -192,10 +192,12 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
-        from accelcal_cli.output.console import show_study
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views import blocks
 
         plotted: dict[str, Any] = {"Convergence": found} if (found := curves(study, records)) else {}
-        show_study(study.subject, [replace(rows.filled(), title="")], plotted, study.conditions)
+        tables = [replace(rows.filled(), title="")]
+        show(blocks.study(study.subject, tables, plotted, study.conditions))
     sys.stdout.flush()
 
 

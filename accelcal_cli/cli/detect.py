@@ -107,9 +107,10 @@ def _show(found: Detection, format: str, output: str | None, plot: str | None, q
     elif format == "csv":
         write_csv(poses_table(found), sys.stdout)
     elif output != "-":
-        from accelcal_cli.output.console import show_detection
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.detection import blocks
 
-        show_detection(found)
+        show(blocks(found))
     sys.stdout.flush()
     if output not in (None, "-") and not quiet:
         typer.echo(f"accelcal: wrote {output}", err=True)

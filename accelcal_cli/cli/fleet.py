@@ -130,8 +130,8 @@ def _check_output(output: str) -> bool:
 def _with_results(readings: FleetReadings, settings: Settings, output: str) -> Fleet:
     """Calibrate, and write the result file of every sensor to a folder."""
     from accelcal_cli.calibration.fleet import calibrate_fleet
-    from accelcal_cli.output.console import write_result
     from accelcal_cli.output.files import whole_folder
+    from accelcal_cli.output.machine import write_result
 
     with whole_folder(output) as made:
         return calibrate_fleet(
@@ -142,21 +142,21 @@ def _with_results(readings: FleetReadings, settings: Settings, output: str) -> F
 def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
     from accelcal_cli.calibration.fleet import standouts
-    from accelcal_cli.output import console as shown
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv, write_table
     from accelcal_cli.views import fleet as fleet_tables
 
     found = standouts(fleet, settings.g)
     rows = fleet_tables.sensors(fleet, readings.sensors, found)
     if output is not None:
-        shown.write_table(rows, output)
+        write_table(rows, output)
     if format == "json":
         sys.stdout.write(json_text(json_rows([rows])))
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
-        tables = fleet_tables.summary(fleet, readings.sensors, found, settings.g)
-        shown.show_fleet(fleet_tables.counts(fleet), tables)
+        from accelcal_cli.output.console import show
+
+        show(fleet_tables.blocks(fleet, readings.sensors, found, settings.g))
 
 
 def _tell(readings: FleetReadings, output: str | None, assumed: float | None) -> None:

@@ -186,9 +186,9 @@ def show(study: Navigation, records: Sequence[Record], format: str) -> None:
     elif format == "csv":
         write_csv(rows, sys.stdout)
     elif format:
-        from accelcal_cli.output import console as rich_console
+        from accelcal_cli.output.console import show
 
-        rich_console.show_split(rows, rich_console.console())
+        show([rows])
     sys.stdout.flush()
 
 
@@ -220,9 +220,9 @@ def reproduce(
     elif format == "csv":
         write_csv(table, sys.stdout)
     else:
-        from accelcal_cli.output import console as rich_console
+        from accelcal_cli.output.console import show
 
-        rich_console.show_split(table, rich_console.console())
+        show([table])
     sys.stdout.flush()
     _write(study, records, None, plot)
     if not quiet:

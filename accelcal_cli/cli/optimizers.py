@@ -18,18 +18,18 @@ def command(
     quiet: options.Quiet = False,  # noqa: ARG001  # every command takes it; this one never says more than it lists
 ) -> None:
     """List the optimizers, their settings and their papers."""
-    from accelcal_cli.output import console as show
+    from accelcal_cli.output.console import show
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.views.optimizers import catalogue, settings
+    from accelcal_cli.views.optimizers import catalogue, catalogue_blocks, flat, settings, settings_blocks
 
     options.check_format(format)
     table = settings(name) if name else catalogue()
     if format == "json":
         sys.stdout.write(json_text(json_rows([table])))
     elif format == "csv":
-        write_csv(show.flat(table), sys.stdout)
+        write_csv(flat(table), sys.stdout)
     elif name:
-        show.show_settings(table)
+        show(settings_blocks(table))
     else:
-        show.show_catalogue(table)
+        show(catalogue_blocks(table))
     sys.stdout.flush()

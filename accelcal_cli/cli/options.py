@@ -351,7 +351,7 @@ def run(
         AccelcalError: what the study, the journal or the cluster could not do.
     """
     _check(raw, jobs, cluster, resume)
-    from accelcal_cli.output.machine import write_raw
+    from accelcal_cli.output.machine import write_table
     from accelcal_cli.studies.engine import Journal, run_study
     from accelcal_cli.studies.study import raw_table
 
@@ -360,7 +360,7 @@ def run(
         with _progress(quiet) as progress:
             records = run_study(study, journal, _executors(study, jobs, cluster), progress)
         if raw is not None:
-            write_raw(raw_table(study, records), raw)
+            write_table(raw_table(study, records), raw)
     except KeyboardInterrupt as stop:
         ending = signals.interrupted(stop)
         raise Interrupted(f"{ending}{_kept(journal)}", ending.code) from None

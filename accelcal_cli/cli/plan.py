@@ -148,21 +148,13 @@ def _plan(
 
 def _show(found: Plan, format: str) -> None:
     from accelcal_cli.output.machine import json_text, write_csv
-    from accelcal_cli.planning.plan import parameter_table, pose_table, record
+    from accelcal_cli.views.plan import blocks, pose_table, record
 
     if format == "json":
         sys.stdout.write(json_text(record(found)))
     elif format == "csv":
         write_csv(pose_table(found), sys.stdout)
     else:
-        from accelcal_cli.output import console
+        from accelcal_cli.output.console import show
 
-        out = console.console()
-        known = found.so_far
-        if known is not None and (known.cautions or found.beyond_poses):
-            console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
-            out.print()
-        console.show_split(pose_table(found), out)
-        expected = parameter_table(found)
-        if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
-            console.show([expected], out)
+        show(blocks(found))

@@ -76,9 +76,9 @@ def _list(table: Table, format: str, stated: Sequence[object]) -> None:
     elif format == "csv":
         write_csv(table, sys.stdout)
     else:
-        from accelcal_cli.output import console
+        from accelcal_cli.output.console import show
 
-        console.show([table], console.console())
+        show([table])
     sys.stdout.flush()
 
 
@@ -95,7 +95,8 @@ def _show(experiment: Experiment, records: Sequence[Record], format: str) -> Non
             sys.stdout.write("\n" if number else "")
             write_csv(table, sys.stdout)
     else:
-        from accelcal_cli.output.console import show_study
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.blocks import study
 
-        show_study(experiment.title, shown, curves(experiment, records, shown=True), experiment.note)
+        show(study(experiment.title, shown, curves(experiment, records, shown=True), experiment.note))
     sys.stdout.flush()

@@ -83,6 +83,7 @@ def _show(found: Verification, format: str) -> None:
 
         write_csv(differences(found), sys.stdout)
     else:
-        from accelcal_cli.output.console import show_verification
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.verification import blocks
 
-        show_verification(found)
+        show(blocks(found))
