@@ -14,7 +14,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Int
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.observability import Observability, attitudes, directions_of, information
+from accelcal_cli.calibration.observability import Observability, attitudes, directions_of
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import search, state
 from accelcal_cli.calibration.settings import Settings
@@ -321,7 +321,7 @@ def screen(readings: Readings, g: float) -> Screened:
     if plain.start.sources[0] == "sphere":
         # Where the poses determine no more than the nearest sphere, no search has to find that out.
         middle = np.zeros_like(plain.cost.box.centre)
-        if Observability.of(information(plain.cost, middle)[0], readings.poses).verdict == "undetermined":
+        if Observability.of(plain.cost.information(middle)[0], readings.poses).verdict == "undetermined":
             K, D = plain.cost.parameters(middle)
             return Screened(ErrorModel(K[0], D[0]), np.nan, np.nan, np.inf, "undetermined")
     result = fit(search(state(sample, settings), closed=True))
