@@ -9,12 +9,11 @@ import numpy as np
 
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.config import load_sensor
 from accelcal_cli.detection.detect import Detection, DetectSettings, detect
 from accelcal_cli.detection.rawlog import open_raw_log
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, simulate_log
+from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate_log
 
 G, POSES, MODEL_ERROR = 9.80665, 18, 0.003
 """m/s^2, poses of a log, and the error that each keeps beside its noise, m/s^2."""

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from accelcal_cli.config import load_sensor
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, simulate_log
+from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate_log
 from benchmarks.clock import pairs, process, report
 
 G = 9.80665

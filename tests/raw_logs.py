@@ -6,10 +6,9 @@ import io
 
 import numpy as np
 
-from accelcal_cli.config import load_sensor
 from accelcal_cli.detection.rawlog import RawLog, open_raw_log
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, simulate_log
+from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate_log
 
 G = 9.80665
 

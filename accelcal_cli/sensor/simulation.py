@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.errors import ConfigError
+from accelcal_cli.config import load_mapping, shipped
+from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import ErrorModel
 
 HOLD_SPREAD = 0.2
@@ -72,6 +74,22 @@ class Sensor:
     def model(self) -> ErrorModel:
         """Its error model."""
         return ErrorModel(np.array(self.K_a), np.array(self.D_a))
+
+
+def load_sensor(name: str) -> Sensor:
+    """Return a sensor by the name of a shipped configuration or by the path of a file.
+
+    Raises:
+        ConfigError: neither such a configuration nor such a file, or one that says something unknown.
+    """
+    files = shipped("sensors")
+    path = files.get(name, Path(name))
+    if name not in files and not path.suffix:
+        raise ConfigError(
+            f'unknown sensor "{name}"{did_you_mean(name, files)}; known: {", ".join(files)}, or the path of a '
+            "YAML file"
+        )
+    return from_mapping(Sensor, load_mapping(path), str(path))
 
 
 @dataclass(frozen=True)
