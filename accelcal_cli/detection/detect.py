@@ -240,14 +240,17 @@ def explain_too_few(segmentation: Segmentation, count: CandidateThreshold, detec
     """Say why no multiplier finds enough attitudes, and what would help, by what the nearest one leads to."""
     level, least, multiplier = detection.level, detection.settings.least_poses, count.multiplier
     poses, alike = _counted(count.poses, "still pose"), _counted(count.attitudes, "attitude")
-    parts = [
-        f"{poses} in {alike}, fewer than {least}" if count.poses else f"no still pose, {least} are needed",
-        f"quietest variance {level.quietest:.4g}, threshold {multiplier * level.variance:.4g} "
-        f"(multiplier {multiplier:g})",
-        _describe_lengths(segmentation, detection.rows),
-        _advise(segmentation, count, detection),
-    ]
-    return "; ".join(parts)
+    return "; ".join(
+        [
+            f"{poses} in {alike}, fewer than {least}"
+            if count.poses
+            else f"no still pose, {least} are needed",
+            f"quietest variance {level.quietest:.4g}, threshold {multiplier * level.variance:.4g} "
+            f"(multiplier {multiplier:g})",
+            _describe_lengths(segmentation, detection.rows),
+            _advise(segmentation, count, detection),
+        ]
+    )
 
 
 def _describe_lengths(segmentation: Segmentation, rows: RowLengths) -> str:

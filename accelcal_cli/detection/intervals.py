@@ -231,7 +231,7 @@ def merge(intervals: Intervals, groups: Sequence[Int]) -> Intervals:
     """Return one interval for each group: it spans them all, and its rows are theirs taken together."""
     first = np.array([group.min() for group in groups], dtype=np.intp)
     last = np.array([group.max() for group in groups], dtype=np.intp)
-    n, mean, square = [], [], []
+    n, mean, scatter = [], [], []
     for group in groups:
         rows, centre = intervals.n[group], intervals.mean[group]
         total = rows.sum()
@@ -240,11 +240,17 @@ def merge(intervals: Intervals, groups: Sequence[Int]) -> Intervals:
         n.append(total)
         mean.append(middle)
         # Scatter within the intervals: how they differ is the attitude's, not the noise of a reading.
-        square.append(np.sqrt(within / max(total - len(group), 1)))
+        scatter.append(np.sqrt(within / max(total - len(group), 1)))
     time = intervals.time
     spans = None if time is None else np.stack([time[first, 0], time[last, 1]], axis=1)
-    joined = replace(intervals.take(first), end=intervals.end[last], time=spans)
-    return replace(joined, n=np.array(n), mean=np.array(mean), scatter=np.array(square))
+    return replace(
+        intervals.take(first),
+        end=intervals.end[last],
+        n=np.array(n),
+        mean=np.array(mean),
+        scatter=np.array(scatter),
+        time=spans,
+    )
 
 
 def _trim(first: Int, last: Int, lengths: RowLengths) -> tuple[Int, Int]:

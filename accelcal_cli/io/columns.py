@@ -99,8 +99,12 @@ class Columns:
     @property
     def extras(self) -> tuple[int, ...]:
         """Numeric columns other than the output: count, scatter, reference, temperature, as far as present."""
-        count, temperature = _present(self.count), _present(self.temperature)
-        return (*count, *(self.scatter or ()), *(self.reference or ()), *temperature)
+        return (
+            *_present(self.count),
+            *(self.scatter or ()),
+            *(self.reference or ()),
+            *_present(self.temperature),
+        )
 
     def selection(self) -> Selection:
         """Return what to ask of the table; a standard deviation or temperature may be missing in a row."""

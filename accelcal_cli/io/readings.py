@@ -216,14 +216,13 @@ class Collector:
             sha256: of the input; where: how to name a row (from 0) to the user.
         """
         columns, means = self.columns, self._means
-        count: Float | None = None
-        scatter: Float | None = None
-        others: Float | None = None
+        extras: tuple[Float | None, Float | None, Float | None] = (None, None, None)
         if means is not None:
-            count, scatter, others = means.count(), means.scatter(), means.mean[:, 3:]
+            extras = means.count(), means.scatter(), means.mean[:, 3:]
             self._take_means(means)
         elif self._extras:
-            count, scatter, others = columns.split(np.concatenate(self._extras))
+            extras = columns.split(np.concatenate(self._extras))
+        count, scatter, others = extras
         self._check()
         _, first = next(self.store.blocks(LOOKED_AT))
         log: tuple[str, ...] = ()

@@ -30,9 +30,7 @@ def log_cautions(rows: int, first: Float, span: float, *, timed: bool) -> tuple[
         rows: how many; first: the first of them, shape (B, 3), LOOKED_AT at most.
         span: the largest range of an axis; timed: whether they have times.
     """
-    if rows < RAW_ROWS:
-        return ()
-    if not timed and np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) >= ALIKE * span:
+    if rows < RAW_ROWS or not (timed or np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) < ALIKE * span):
         return ()
     return (
         f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, find its poses with "
