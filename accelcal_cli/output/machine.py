@@ -16,11 +16,12 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from accelcal_cli.output.files import whole_file
-from accelcal_cli.sensor.simulation import Stretch
 from accelcal_cli.table import Table
 
 if TYPE_CHECKING:
     import polars
+
+    from accelcal_cli.sensor.simulation import LogSegment
 
 
 def write_csv(table: Table, file: IO[str]) -> None:
@@ -88,7 +89,7 @@ def _finite(value: object) -> object:
 DIGITS = "%.9g"
 
 
-def write_log(stretches: Iterable[Stretch], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
+def write_log(stretches: Iterable[LogSegment], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
     """Write the rows as they come; return first and last row of each hold, counted from 1."""
     file.write("t,ax,ay,az" + ",wx,wy,wz" * gyro + "\n")
     holds, row = [], 0

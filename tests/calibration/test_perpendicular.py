@@ -14,8 +14,7 @@ from accelcal_cli.calibration.fleet import check_settings
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.exporters.base import Target
-from accelcal_cli.exporters.formats import export
+from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.planning.plan import plan, pose_table
@@ -40,7 +39,9 @@ def test_six_faces_determine_scale_factors_and_biases(optimizer):
     np.testing.assert_allclose(result.K_a, ALIGNED.K, atol=1e-9 * ALIGNED.K[0, 0])
     np.testing.assert_allclose(result.D_a, ALIGNED.D, atol=1e-8 * ALIGNED.K[0, 0])
     assert (result.verdict, result.freedom) == ("weak", 0)
-    assert result.reasons == ("Six poses leave nothing to judge their noise by: no sigma. Take at least 12.",)
+    assert result.reasons == (
+        "Six poses leave no degrees of freedom, so no uncertainty can be given. Take at least 12.",
+    )
     assert result.dop.scale == pytest.approx(np.sqrt(0.5), rel=1e-2)
     assert result.dop.misalignment == 0
     assert any("taken as perpendicular" in caution for caution in result.cautions)
@@ -133,5 +134,5 @@ def test_nothing_is_dropped_that_was_not_estimated():
     result = calibrate(read(poses.turns(), sigma=1e-2), SIX)
     scale = float(np.diagonal(result.K_a).mean())
     for name in ("px4", "ardupilot"):
-        made = export(result, name, Target(driver_scale=scale))
+        made = EXPORTERS.get(name)(driver_scale=scale).export(result)
         assert not any("misalignments" in warning for warning in made.warnings)
