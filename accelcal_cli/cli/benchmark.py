@@ -116,14 +116,15 @@ def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
 
     rows = benchmark_table(study, records)
     if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show_benchmark
+        from accelcal_cli.output.console import show
         from accelcal_cli.studies.benchmark import rank
         from accelcal_cli.studies.study import median_curves
+        from accelcal_cli.views.blocks import benchmark
         from accelcal_cli.views.studies import benchmark_title, ranking_table
 
         ranking = rank(study, records)
         further = [ranking_table(ranking)] if ranking else []
-        show_benchmark(benchmark_title(study), rows, median_curves(study, records), study.tolerance, further)
+        show(benchmark(benchmark_title(study), rows, median_curves(study, records), study.tolerance, further))
     sys.stdout.flush()
 
 

@@ -219,6 +219,7 @@ def _show(result: Calibration, format: str, output: str | None) -> None:
     from accelcal_cli.views.calibration import values
 
     if not options.print_data(format, result.record, lambda: values(result)):
-        from accelcal_cli.output.console import show_calibration
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.calibration import blocks
 
-        show_calibration(result)
+        show(blocks(result))

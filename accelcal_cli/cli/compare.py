@@ -199,14 +199,15 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
 
     rows = comparison_table(study, records)
     if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show_study
+        from accelcal_cli.output.console import show
         from accelcal_cli.studies.study import median_curves
+        from accelcal_cli.views import blocks
         from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
 
         panels = median_curves(study, records)
         plotted = {"Convergence": panels[""]} if panels[""] else {}
         title, note = comparison_subject(study), comparison_conditions(study)
-        show_study(title, [replace(rows.filled(), title="")], plotted, note)
+        show(blocks.study(title, [replace(rows.filled(), title="")], plotted, note))
     sys.stdout.flush()
 
 

@@ -87,7 +87,8 @@ def _show(detection: Detection, format: str, output: str | None) -> None:
             write_csv(poses_table(detection), file)
     printed = options.print_data(format, lambda: record(detection), lambda: poses_table(detection))
     if not printed and output != "-":
-        from accelcal_cli.output.console import show_detection
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.detection import blocks
 
-        show_detection(detection)
+        show(blocks(detection))
     sys.stdout.flush()

@@ -180,9 +180,9 @@ def _show(study: Navigation, records: Sequence[Record], format: str) -> None:
 
     rows = summary(study, records)
     if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import console, show_split
+        from accelcal_cli.output.console import show
 
-        show_split(rows, console())
+        show([rows])
     sys.stdout.flush()
 
 

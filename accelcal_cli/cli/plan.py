@@ -144,18 +144,9 @@ def _plan(
 
 
 def _show(proposal: Plan, format: str) -> None:
-    from accelcal_cli.planning.plan import parameter_table, pose_table, record
+    from accelcal_cli.views.plan import blocks, pose_table, record
 
-    if options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
-        return
-    from accelcal_cli.output import console
+    if not options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
+        from accelcal_cli.output.console import show
 
-    out = console.console()
-    known = proposal.so_far
-    if known is not None and (known.cautions or proposal.beyond_poses):
-        console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
-        out.print()
-    console.show_split(pose_table(proposal), out)
-    expected = parameter_table(proposal)
-    if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
-        console.show([expected], out)
+        show(blocks(proposal))

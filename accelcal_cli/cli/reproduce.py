@@ -63,14 +63,16 @@ def _experiment(
     experiment: Experiment, study_options: running.StudyOptions, plot: str | None, format: str
 ) -> None:
     """Run an experiment on optimizers and print it beside the paper's numbers."""
-    from accelcal_cli.output.console import show_study
+    from accelcal_cli.output.console import show
     from accelcal_cli.studies.reproduce import curves
+    from accelcal_cli.views import blocks
     from accelcal_cli.views.experiments import experiment_tables
 
     records = study_options.run(experiment)
     results = experiment_tables(experiment, records)
     if format == "table":
-        show_study(experiment.title, results, curves(experiment, records, shown=True), experiment.note)
+        plotted = curves(experiment, records, shown=True)
+        show(blocks.study(experiment.title, results, plotted, experiment.note))
     else:
         _print(experiment.name, experiment.title, results, format)
     sys.stdout.flush()
@@ -90,7 +92,7 @@ def _voyage(
 ) -> None:
     """Run an experiment on navigation filters and print it beside the paper's numbers."""
     from accelcal_cli.navigation.study import Navigation, load_study
-    from accelcal_cli.output.console import console, show_split
+    from accelcal_cli.output.console import show
     from accelcal_cli.views.navigation import chart_of, curves, summary, with_paper
 
     settings = load_study(name, {"runs": runs, "seed": seed})
@@ -98,7 +100,7 @@ def _voyage(
     records = study_options.run(study)
     table = with_paper(summary(study, records), settings)
     if format == "table":
-        show_split(table, console())
+        show([table])
     else:
         _print(name, settings.title, [table], format)
     sys.stdout.flush()
@@ -125,7 +127,7 @@ def _list(table: Table, format: str, stated: Sequence[object]) -> None:
     if any(value is not None for value in stated):
         raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
     if not options.print_rows(format, table):
-        from accelcal_cli.output.console import console, show
+        from accelcal_cli.output.console import show
 
-        show([table], console())
+        show([table])
     sys.stdout.flush()

@@ -17,11 +17,12 @@ from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.planning.plan import plan, pose_table
+from accelcal_cli.planning.plan import plan
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.verification.verify import verify
 from accelcal_cli.views.calibration import tables
+from accelcal_cli.views.plan import pose_table
 
 G = 9.8
 ALIGNED = ErrorModel(np.diag(np.diagonal(DPSO.K)), DPSO.D)
