@@ -10,12 +10,14 @@ import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, Generic, TypeVar
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float, Int
+from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
@@ -120,3 +122,18 @@ OPTIMIZERS: Registry[Optimizer[State]] = Registry(
     Optimizer, "accelcal_cli.optimization.algorithms", "optimizer", "accelcal.optimizers"
 )
 """All optimizers by name. One that comes from here takes the States that it returned, and no others."""
+
+
+def optimizer_file(name: str) -> Path | None:
+    """Return the YAML file of an optimizer, None where there is none.
+
+    That is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
+    """
+    return shipped("optimizers").get(name) or OPTIMIZERS.beside(name, ".yaml")
+
+
+def shipped_parameters(optimizer: object) -> dict[str, Any]:
+    """Return the settings that the file of an optimizer states; none for an unknown one."""
+    path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
+    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
+    return parameters

@@ -9,9 +9,9 @@ from multiprocessing import get_context
 import optimizer_contract as contract
 import pytest
 
-from accelcal_cli.config import load_mapping, optimizer_file
+from accelcal_cli.config import load_mapping
 from accelcal_cli.optimization.minimize import minimize
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, State, optimizer_file
 
 NAMES = OPTIMIZERS.names()
 PAIRS = [(name, case) for name in NAMES for case in contract.cases(OPTIMIZERS.get(name))]
