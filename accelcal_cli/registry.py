@@ -68,7 +68,7 @@ class Registry(Generic[T]):
         self.faults = {}
         for name in self._entry_points:
             try:
-                self._find(name)
+                self.find(name)
             except ConfigError as error:
                 self.faults[name] = str(error)
         return sorted(self._classes)
@@ -80,7 +80,7 @@ class Registry(Generic[T]):
             ConfigError: no such name (the message gives the nearest one and lists all), or an installed class that
                 cannot be loaded (the message names its package and its entry point).
         """
-        cls = self._find(name)
+        cls = self.find(name)
         if cls is None:
             known = self.names()
             raise ConfigError(
@@ -88,18 +88,12 @@ class Registry(Generic[T]):
             )
         return cls
 
-    def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
-        """Build the class called `name` from `mapping`; see `schema.build`."""
-        return schema.build(self.get(name), mapping, where)
+    def find(self, name: str) -> type[T] | None:
+        """Return the class called `name`: built in, or else installed; None when there is none.
 
-    def beside(self, name: str, suffix: str) -> Path | None:
-        """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""
-        cls = self._find(name)
-        path = Path(inspect.getfile(cls)).with_name(f"{name}{suffix}") if cls else None
-        return path if path and path.is_file() else None
-
-    def _find(self, name: str) -> type[T] | None:
-        """Return the class called `name`: built in, or else installed; None when there is none."""
+        Raises:
+            ConfigError: an installed class that cannot be loaded.
+        """
         if name not in self._classes and name.replace("-", "").isalnum():
             module = f"{self.package}.{name.replace('-', '_')}"
             try:
@@ -110,6 +104,16 @@ class Registry(Generic[T]):
         if name not in self._classes and name in self._entry_points:
             self.register(name)(self._load(self._entry_points[name]))
         return self._classes.get(name)
+
+    def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
+        """Build the class called `name` from `mapping`; see `schema.from_mapping`."""
+        return schema.from_mapping(self.get(name), mapping, where)
+
+    def beside(self, name: str, suffix: str) -> Path | None:
+        """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""
+        cls = self.find(name)
+        path = Path(inspect.getfile(cls)).with_name(f"{name}{suffix}") if cls else None
+        return path if path and path.is_file() else None
 
     @cached_property
     def _entry_points(self) -> dict[str, EntryPoint]:

@@ -88,8 +88,8 @@ def command(
     evaluations, and ranks with a significance test when several optimizers run on several functions.
     """
     from accelcal_cli.studies.benchmark import Benchmark
-    from accelcal_cli.studies.entries import ALL, Budget, choose, words
     from accelcal_cli.studies.functions import select
+    from accelcal_cli.studies.study import ALL, Budget, choose, words
 
     options.check_apart([config], {"--raw": study_options.raw, "--plot": plot})
     running.check_plot(plot)
@@ -112,21 +112,25 @@ def command(
 
 
 def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.studies.benchmark import curves, summary
+    from accelcal_cli.views.studies import benchmark_table
 
-    rows = summary(study, records)
+    rows = benchmark_table(study, records)
     if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show_benchmark
-        from accelcal_cli.studies.benchmark import rank, table
+        from accelcal_cli.output.console import show
+        from accelcal_cli.studies.benchmark import rank
+        from accelcal_cli.studies.study import median_curves
+        from accelcal_cli.views.blocks import benchmark
+        from accelcal_cli.views.studies import benchmark_title, ranking_table
 
         ranking = rank(study, records)
-        further = [table(ranking)] if ranking else []
-        show_benchmark(study.title, rows, curves(study, records), study.tolerance, further)
+        further = [ranking_table(ranking)] if ranking else []
+        show(benchmark(benchmark_title(study), rows, median_curves(study, records), study.tolerance, further))
     sys.stdout.flush()
 
 
 def _plot(study: Benchmark, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.benchmark import curves
+    from accelcal_cli.studies.study import median_curves
+    from accelcal_cli.views.studies import benchmark_title
 
-    plot_convergence(study.title, curves(study, records), study.tolerance, path)
+    plot_convergence(benchmark_title(study), median_curves(study, records), study.tolerance, path)

@@ -173,7 +173,8 @@ def command(
 
 def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Settings:
     """Return the settings; poses of a raw log are weighted unless the file says otherwise."""
-    from accelcal_cli.config import load_mapping, load_settings
+    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.config import load_mapping
 
     if raw:
         keys = {} if config is None else load_mapping(config)
@@ -218,6 +219,7 @@ def _show(result: Calibration, format: str, output: str | None) -> None:
     from accelcal_cli.views.calibration import values
 
     if not options.print_data(format, result.record, lambda: values(result)):
-        from accelcal_cli.output.console import show_calibration
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.calibration import blocks
 
-        show_calibration(result)
+        show(blocks(result))

@@ -180,7 +180,7 @@ def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) 
         except AccelcalError as error:
             ending = error
         try:
-            file.save(capture.taken, last=True)
+            file.save(capture.poses, last=True)
         except OutputError as error:
             ending = error
     summary = _summary(capture, file)
@@ -199,7 +199,7 @@ def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Wa
         if status is None:
             continue
         if status.state == "taken":
-            file.save(capture.taken)
+            file.save(capture.poses)
         watch.see(status)
         if status.state == "taken" and not capture.missing():
             return
@@ -208,7 +208,7 @@ def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Wa
 def _summary(capture: Capture, file: PoseFile) -> str:
     """Return what to say of the poses that are written."""
     if not file.kept:
-        parts = ["no pose was taken"] * (not capture.taken) + ["nothing is written"] * (not file.flows)
+        parts = ["no pose was taken"] * (not capture.poses) + ["nothing is written"] * (not file.flows)
         return ", ".join(parts) or "no pose is written"
     where = "" if file.path == "-" else f" in {file.path}"
     missing = len(capture.missing())

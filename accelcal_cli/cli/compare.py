@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -71,8 +71,8 @@ class SimulationOptions:
         """
         import numpy as np
 
-        from accelcal_cli.config import load_sensor
         from accelcal_cli.sensor.poses import directions
+        from accelcal_cli.sensor.simulation import load_sensor
         from accelcal_cli.studies.scenarios import FEWEST, Simulation
 
         count = 12 if self.positions is None else self.positions
@@ -148,8 +148,8 @@ def command(
     """
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.studies.compare import Comparison
-    from accelcal_cli.studies.entries import Budget, choose, words
-    from accelcal_cli.studies.scenarios import Search
+    from accelcal_cli.studies.scenarios import SearchSpace
+    from accelcal_cli.studies.study import Budget, choose, words
 
     sensor = simulation.sensor
     type_file = sensor if sensor is not None and Path(sensor).suffix else None
@@ -157,7 +157,7 @@ def command(
     running.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
-    space = Search(options.GravityOptions(g).stated() or STANDARD_GRAVITY, _unknowns(gauge))
+    space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, _unknowns(gauge))
     entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
     source: Simulation | Recording
     if data is not None:
@@ -195,21 +195,27 @@ def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOp
 
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.studies.compare import curves, summary
+    from accelcal_cli.views.experiments import comparison_table
 
-    rows = summary(study, records)
+    rows = comparison_table(study, records)
     if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show_study
+        from accelcal_cli.output.console import show
+        from accelcal_cli.studies.study import median_curves
+        from accelcal_cli.views import blocks
+        from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
 
-        convergence = curves(study, records)
-        plotted: dict[str, Any] = {"Convergence": convergence} if convergence else {}
-        show_study(study.subject, [replace(rows.filled(), title="")], plotted, study.conditions)
+        panels = median_curves(study, records)
+        plotted = {"Convergence": panels[""]} if panels[""] else {}
+        title, note = comparison_subject(study), comparison_conditions(study)
+        show(blocks.study(title, [replace(rows.filled(), title="")], plotted, note))
     sys.stdout.flush()
 
 
 def _plot(study: Comparison, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.compare import curves
+    from accelcal_cli.studies.study import median_curves
+    from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
 
     tolerance = 0.0 if study.noisy else study.tolerance
-    plot_convergence(study.subject, {study.conditions: curves(study, records)}, tolerance, path)
+    panels = {comparison_conditions(study): median_curves(study, records)[""]}
+    plot_convergence(comparison_subject(study), panels, tolerance, path)

@@ -59,7 +59,7 @@ def command(
     try:
         detection = log.detect(data, columns, local_g, picture=plot is not None)
     except TooFewPosesError as failure:
-        _draw(failure.found, plot, quiet)
+        _draw(failure.detection, plot, quiet)
         raise
     _show(detection, format, output)
     options.tell_written([output], quiet)
@@ -87,7 +87,8 @@ def _show(detection: Detection, format: str, output: str | None) -> None:
             write_csv(poses_table(detection), file)
     printed = options.print_data(format, lambda: record(detection), lambda: poses_table(detection))
     if not printed and output != "-":
-        from accelcal_cli.output.console import show_detection
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.detection import blocks
 
-        show_detection(detection)
+        show(blocks(detection))
     sys.stdout.flush()

@@ -90,7 +90,8 @@ def command(
     Exit code 1 means that a sensor is undetermined or failed, or missed the --tolerance.
     """
     from accelcal_cli.calibration.fleet import calibrate_fleet, check_settings
-    from accelcal_cli.config import load_mapping, load_settings
+    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.config import load_mapping
     from accelcal_cli.io.fleet import read_fleet
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
@@ -145,8 +146,8 @@ def _check_output(output: str) -> bool:
 def _with_results(readings: FleetReadings, settings: Settings, output: str) -> Fleet:
     """Calibrate, and write the result file of every sensor to a folder."""
     from accelcal_cli.calibration.fleet import calibrate_fleet
-    from accelcal_cli.output.console import write_result
     from accelcal_cli.output.files import whole_folder
+    from accelcal_cli.output.machine import write_result
 
     with whole_folder(output) as folder:
         return calibrate_fleet(
@@ -157,16 +158,17 @@ def _with_results(readings: FleetReadings, settings: Settings, output: str) -> F
 def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
     from accelcal_cli.calibration.fleet import standouts
-    from accelcal_cli.output import console
+    from accelcal_cli.output.machine import write_table
     from accelcal_cli.views import fleet as fleet_tables
 
     outlying = standouts(fleet, settings.g)
     rows = fleet_tables.sensors(fleet, readings.sensors, outlying)
     if output is not None:
-        console.write_table(rows, output)
+        write_table(rows, output)
     if not options.print_rows(format, rows):
-        tables = fleet_tables.summary(fleet, readings.sensors, outlying, settings.g)
-        console.show_fleet(fleet_tables.counts(fleet), tables)
+        from accelcal_cli.output.console import show
+
+        show(fleet_tables.blocks(fleet, readings.sensors, outlying, settings.g))
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:

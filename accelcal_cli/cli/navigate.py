@@ -12,8 +12,8 @@ from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.navigation.ins import Grade
-    from accelcal_cli.navigation.study import FilterEntry, Navigation, Waters
+    from accelcal_cli.navigation.ins import InsGrade
+    from accelcal_cli.navigation.study import FilterEntry, Navigation, NavigationSettings
     from accelcal_cli.studies.study import Record
 
 MODES = ("default", "literal", "both")
@@ -103,8 +103,8 @@ def command(
     setting = options.stated(map=map, voyage=voyage, period=period)
     limits = {"particles": particles, "generations": generations}
     repeats = options.stated(runs=runs, seed=seed)
-    study = _study(config, setting, filter or (), mode, limits, repeats, calibration)
-    inputs = [config, calibration, *study.waters.files()]
+    study = _study(config, {**setting, **repeats}, filter or (), mode, limits, calibration)
+    inputs = [config, calibration, *study.settings.files()]
     options.check_apart(inputs, {"-o": output, "--raw": study_options.raw, "--plot": plot})
     records = study_options.run(study)
     if output != "-":
@@ -127,45 +127,41 @@ def _check(mode: str | None, output: str | None, format: str) -> None:
 
 def _study(
     config: Path | None,
-    setting: Mapping[str, Any],
+    stated: Mapping[str, Any],
     names: Sequence[str],
     mode: str | None,
     limits: Mapping[str, Any],
-    repeats: Mapping[str, Any],
     calibration: str | None,
 ) -> Navigation:
     """Return the study that file and command line state together."""
-    from accelcal_cli.navigation.study import Navigation, Repeats, load_waters
-    from accelcal_cli.schema import build
-    from accelcal_cli.studies.entries import words
+    from accelcal_cli.navigation.study import Navigation, load_study
+    from accelcal_cli.studies.study import words
 
-    waters, own, further = load_waters(config, setting)
-    filed: dict[str, Any] = {key: further[key] for key in ("runs", "seed") if key in further}
-    repeated = build(Repeats, {**filed, **repeats}, str(config or "command line"))
-    entries = _entries(words(names), own, mode, limits)
-    grades: tuple[Grade, ...] = (waters.ins,)
+    settings = load_study(config, stated)
+    entries = _entries(words(names), settings.filters, mode, limits)
+    grades: tuple[InsGrade, ...] = (settings.ins,)
     if calibration is not None:
-        waters, grades = _calibrated(waters, calibration)
-    return Navigation(waters.hashed(), tuple(entries), grades, repeated.runs, repeated.seed)
+        settings, grades = _calibrated(settings, calibration)
+    return Navigation(settings.with_digests(), tuple(entries), grades)
 
 
 def _entries(
     names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, limits: Mapping[str, Any]
 ) -> list[FilterEntry]:
     """Return the filters by name or label, in the modes that were asked for."""
-    from accelcal_cli.navigation.study import FilterEntry, filter_names, limited
+    from accelcal_cli.navigation.study import FilterEntry, filter_names
 
-    stated = {entry.label: entry for entry in own}
+    stated = {entry.name: entry for entry in own}
     wanted = list(names) or list(stated) or [ALL]
     if ALL in wanted:
         wanted = list(dict.fromkeys([*stated, *filter_names()]))
-    chosen = [stated.get(name, FilterEntry(name, name)) for name in wanted]
+    chosen = [stated.get(name) or FilterEntry(name) for name in wanted]
     modes: list[str | None] = ["default", "literal"] if mode == "both" else [mode]
-    return [limited(entry, {**limits, "mode": each}) for each in modes for entry in chosen]
+    return [entry.with_settings({**limits, "mode": each}) for each in modes for entry in chosen]
 
 
-def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]:
-    """Return waters and the INS without and with a calibration.
+def _calibrated(settings: NavigationSettings, source: str) -> tuple[NavigationSettings, tuple[InsGrade, ...]]:
+    """Return the settings and the INS without and with a calibration.
 
     The accelerometers are strapped down: on a platform an alignment hides their biases. Any drift is taken that the
     filters can start with.
@@ -173,8 +169,8 @@ def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]
     from accelcal_cli.navigation.study import grade_of
 
     result = options.load_result(source)
-    free = replace(waters, plan=replace(waters.plan, drift=(0.0, waters.initial)))
-    ins = replace(waters.ins, mounting="strapdown")
+    free = replace(settings, plan=replace(settings.plan, drift=(0.0, settings.initial)))
+    ins = replace(settings.ins, mounting="strapdown")
     return free, (ins, grade_of(result, ins, source))
 
 
@@ -184,9 +180,9 @@ def _show(study: Navigation, records: Sequence[Record], format: str) -> None:
 
     rows = summary(study, records)
     if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import console, show_split
+        from accelcal_cli.output.console import show
 
-        show_split(rows, console())
+        show([rows])
     sys.stdout.flush()
 
 

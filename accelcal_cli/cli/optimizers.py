@@ -21,14 +21,18 @@ def command(
         ),
     ] = None,
     format: options.Format = "table",
-    quiet: options.Quiet = False,  # noqa: ARG001  # every command takes it; this one never says more than it lists
+    quiet: options.Quiet = False,
 ) -> None:
     """List the optimizers, their settings and their papers."""
-    from accelcal_cli.output import console
+    from accelcal_cli.optimization.optimizer import OPTIMIZERS
+    from accelcal_cli.output.console import show
     from accelcal_cli.output.machine import json_rows
-    from accelcal_cli.views.optimizers import catalogue, settings
+    from accelcal_cli.views.optimizers import catalogue, catalogue_blocks, flat, settings, settings_blocks
 
     table = settings(name) if name else catalogue()
-    if not options.print_data(format, lambda: json_rows([table]), lambda: console.flat(table)):
-        (console.show_settings if name else console.show_catalogue)(table)
+    if not options.print_data(format, lambda: json_rows([table]), lambda: flat(table)):
+        show(settings_blocks(table) if name else catalogue_blocks(table))
     sys.stdout.flush()
+    if not quiet:
+        for fault in OPTIMIZERS.faults.values():
+            typer.echo(f"accelcal: {fault}", err=True)

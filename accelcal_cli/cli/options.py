@@ -433,16 +433,16 @@ def load_result(source: str, data: str | None = None) -> Calibration:
         UsageError: standard input is a terminal, or `data` is to come from it, too.
         ConfigError, DataError: no result file.
     """
-    from accelcal_cli import config
+    from accelcal_cli.calibration import result
 
     if source != "-":
-        return config.load_result(source)
+        return result.load_result(source)
     if data == "-":
         raise UsageError(
             "- -: standard input is one file; expected the name of the result file or of the readings"
         )
     check_input(source)
-    return config.load_result("<stdin>", sys.stdin.buffer)
+    return result.load_result("<stdin>", sys.stdin.buffer)
 
 
 def print_data(format: str, record: Callable[[], object], table: Callable[[], Table]) -> bool:

@@ -90,7 +90,8 @@ def command(
 def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.calibrate import calibrate
-    from accelcal_cli.config import is_result, load_result, load_settings
+    from accelcal_cli.calibration.result import is_result, load_result
+    from accelcal_cli.calibration.settings import load_settings
     from accelcal_cli.io.readings import read_readings
 
     options.check_input(data)
@@ -143,18 +144,9 @@ def _plan(
 
 
 def _show(proposal: Plan, format: str) -> None:
-    from accelcal_cli.planning.plan import parameter_table, pose_table, record
+    from accelcal_cli.views.plan import blocks, pose_table, record
 
-    if options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
-        return
-    from accelcal_cli.output import console
+    if not options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
+        from accelcal_cli.output.console import show
 
-    out = console.console()
-    known = proposal.so_far
-    if known is not None and (known.cautions or proposal.beyond_poses):
-        console.verdict(known.verdict, known.reasons, out, known.cautions, "Verdict so far")
-        out.print()
-    console.show_split(pose_table(proposal), out)
-    expected = parameter_table(proposal)
-    if len(expected.columns) > 1:  # of poses that determine nothing there is nothing to expect
-        console.show([expected], out)
+        show(blocks(proposal))

@@ -47,10 +47,12 @@ def command(
     from accelcal_cli.studies import reproduce
 
     if name is None:
-        _list(reproduce.catalogue(), format, [study_options.raw, plot, study_options.cluster, runs, seed])
+        from accelcal_cli.views.experiments import catalogue_table
+
+        _list(catalogue_table(), format, [study_options.raw, plot, study_options.cluster, runs, seed])
         return
     running.check_plot(plot)
-    if name in reproduce.voyages():
+    if name in reproduce.navigation_names():
         _voyage(name, runs, seed, study_options, plot, format)
     else:
         _experiment(reproduce.load(name).changed(runs, seed), study_options, plot, format)
@@ -61,13 +63,16 @@ def _experiment(
     experiment: Experiment, study_options: running.StudyOptions, plot: str | None, format: str
 ) -> None:
     """Run an experiment on optimizers and print it beside the paper's numbers."""
-    from accelcal_cli.output.console import show_study
-    from accelcal_cli.studies.reproduce import curves, tables
+    from accelcal_cli.output.console import show
+    from accelcal_cli.studies.reproduce import curves
+    from accelcal_cli.views import blocks
+    from accelcal_cli.views.experiments import experiment_tables
 
-    records = study_options.run(experiment.study())
-    results = tables(experiment, records)
+    records = study_options.run(experiment)
+    results = experiment_tables(experiment, records)
     if format == "table":
-        show_study(experiment.title, results, curves(experiment, records, shown=True), experiment.note)
+        plotted = curves(experiment, records, shown=True)
+        show(blocks.study(experiment.title, results, plotted, experiment.note))
     else:
         _print(experiment.name, experiment.title, results, format)
     sys.stdout.flush()
@@ -86,19 +91,18 @@ def _voyage(
     format: str,
 ) -> None:
     """Run an experiment on navigation filters and print it beside the paper's numbers."""
-    from accelcal_cli.navigation.study import Navigation, load_waters
-    from accelcal_cli.output.console import console, show_split
-    from accelcal_cli.views.navigation import beside, chart_of, curves, summary
+    from accelcal_cli.navigation.study import Navigation, load_study
+    from accelcal_cli.output.console import show
+    from accelcal_cli.views.navigation import chart_of, curves, summary, with_paper
 
-    waters, entries, further = load_waters(name, {})
-    number = further["seed"] if seed is None else seed
-    study = Navigation(waters, tuple(entries), (waters.ins,), runs or further["runs"], number)
+    settings = load_study(name, {"runs": runs, "seed": seed})
+    study = Navigation(settings, settings.filters, (settings.ins,))
     records = study_options.run(study)
-    table = beside(summary(study, records), further)
+    table = with_paper(summary(study, records), settings)
     if format == "table":
-        show_split(table, console())
+        show([table])
     else:
-        _print(name, further["title"], [table], format)
+        _print(name, settings.title, [table], format)
     sys.stdout.flush()
     if plot is not None:
         from accelcal_cli.output.plot import plot_voyage
@@ -123,7 +127,7 @@ def _list(table: Table, format: str, stated: Sequence[object]) -> None:
     if any(value is not None for value in stated):
         raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
     if not options.print_rows(format, table):
-        from accelcal_cli.output.console import console, show
+        from accelcal_cli.output.console import show
 
-        show([table], console())
+        show([table])
     sys.stdout.flush()

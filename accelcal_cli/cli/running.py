@@ -63,16 +63,16 @@ class StudyOptions:
             AccelcalError: what the study, the journal or the cluster could not do.
         """
         self._check()
-        from accelcal_cli.output.machine import write_raw
+        from accelcal_cli.output.machine import write_table
         from accelcal_cli.studies.engine import Journal, run_study
-        from accelcal_cli.studies.study import raw_table
+        from accelcal_cli.views.studies import raw_table
 
         journal = Journal.open(Path(f"{self.raw}.journal") if self.raw else None, study, self.resume)
         try:
             with _progress(self.quiet) as progress:
                 records = run_study(study, journal, self._executors(study), progress)
             if self.raw is not None:
-                write_raw(raw_table(study, records), self.raw)
+                write_table(raw_table(study, records), self.raw)
         except KeyboardInterrupt as stop:
             ending = process.interrupted(stop)
             raise Interrupted(f"{ending}{_kept(journal)}", ending.code) from None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from accelcal_cli.arrays import Float
     from accelcal_cli.sensor.model import ErrorModel
-    from accelcal_cli.sensor.simulation import Sensor, Simulated
+    from accelcal_cli.sensor.simulation import Sensor, SimulatedReadings
 
 MOST_SAMPLES = 100_000_000
 
@@ -77,14 +77,14 @@ def command(
     --sensors they carry the label of their sensor, and `fleet` calibrates each. With --raw they are a log of time,
     acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
-    from accelcal_cli.config import dump, load_sensor
+    from accelcal_cli.config import dump
     from accelcal_cli.output.files import check_target, whole_file
     from accelcal_cli.output.machine import write_log
     from accelcal_cli.rng import Purpose, Streams
-    from accelcal_cli.schema import build
+    from accelcal_cli.schema import from_mapping
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import Handling, handled, simulate, simulate_fleet
+    from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate, simulate_fleet, simulate_log
 
     if raw and sensors is not None:
         raise UsageError("--sensors cannot be used with --raw")
@@ -109,7 +109,9 @@ def command(
     record = _truth(device, local_g, sigma, u)
     with whole_file(output) as file:
         if raw:
-            log = handled(device, u, local_g, build(Handling, stated, "simulate --raw"), sigma, seed)
+            log = simulate_log(
+                device, u, local_g, from_mapping(Handling, stated, "simulate --raw"), sigma, seed
+            )
             record["holds"] = [list(rows) for rows in write_log(log, gyro, file)]
         elif sensors is not None:
             drawn = simulate_fleet(device, sensors, u, local_g, samples, sigma, seed)
@@ -137,7 +139,11 @@ def _header(file: IO[str], first: list[str], labelled: bool, attitude: bool) -> 
 
 
 def _write_fleet(
-    file: IO[str], drawn: Iterable[tuple[ErrorModel, Simulated]], digits: int, labelled: bool, attitude: bool
+    file: IO[str],
+    drawn: Iterable[tuple[ErrorModel, SimulatedReadings]],
+    digits: int,
+    labelled: bool,
+    attitude: bool,
 ) -> dict[str, object]:
     """Write the rows of many sensors; return the true parameters by sensor."""
     truth: dict[str, object] = {}
@@ -149,7 +155,9 @@ def _write_fleet(
     return truth
 
 
-def _write(file: IO[str], readings: Simulated, labelled: bool, attitude: bool, first: str = "") -> None:
+def _write(
+    file: IO[str], readings: SimulatedReadings, labelled: bool, attitude: bool, first: str = ""
+) -> None:
     """Write the rows with the shortest digits that read back to the same numbers, each after the text `first`."""
     for pose, output, force in zip(readings.pose, readings.output, readings.force, strict=True):
         cells = [str(pose)] * labelled + [repr(float(v)) for v in output]

@@ -83,6 +83,7 @@ def _show(verification: Verification, format: str) -> None:
     from accelcal_cli.views.verification import differences
 
     if not options.print_data(format, verification.record, lambda: differences(verification)):
-        from accelcal_cli.output.console import show_verification
+        from accelcal_cli.output.console import show
+        from accelcal_cli.views.verification import blocks
 
-        show_verification(verification)
+        show(blocks(verification))
