@@ -14,7 +14,6 @@ from typing import Any, BinaryIO
 import yaml
 
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
 
 CONFIGS = Path(__file__).parent / "configs"
 """The shipped configurations, inside the installed package."""
@@ -114,15 +113,3 @@ def dump(record: Mapping[str, Any]) -> str:
 def shipped(kind: str) -> dict[str, Path]:
     """Return the shipped files of a kind ("optimizers", "sensors", "studies") by name."""
     return {path.stem: path for path in sorted((CONFIGS / kind).glob("*.yaml"))}
-
-
-def shipped_parameters(optimizer: Any) -> dict[str, Any]:
-    """Return the settings that an optimizer's YAML file states; none for an unknown optimizer.
-
-    The file is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
-    """
-    if not isinstance(optimizer, str):
-        return {}
-    path = shipped("optimizers").get(optimizer) or OPTIMIZERS.beside(optimizer, ".yaml")
-    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
-    return parameters

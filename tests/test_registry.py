@@ -126,7 +126,7 @@ def test_a_broken_package_says_so_in_one_line_and_only_where_it_is_used(installe
 def test_entry_points_are_looked_up_only_for_a_name_that_is_not_built_in():
     line = (
         "import sys; from accelcal_cli.optimization.optimizer import OPTIMIZERS; "
-        "from accelcal_cli.config import shipped_parameters; "
+        "from accelcal_cli.optimization.optimizer import shipped_parameters; "
         "loaded = 'importlib.metadata' in sys.modules; OPTIMIZERS.get('de-pso'); shipped_parameters('de-pso'); "
         "print(loaded or 'importlib.metadata' not in sys.modules, '_entry_points' in vars(OPTIMIZERS))"
     )

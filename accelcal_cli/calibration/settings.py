@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from accelcal_cli.config import load_mapping, shipped_parameters
+from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, shipped_parameters
 from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float, Int
+from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
@@ -96,3 +97,15 @@ class Optimizer(ABC):
 OPTIMIZERS: Registry[Optimizer] = Registry(
     Optimizer, "accelcal_cli.optimization.algorithms", "optimizer", "accelcal.optimizers"
 )
+
+
+def shipped_parameters(optimizer: Any) -> dict[str, Any]:
+    """Return the settings that an optimizer's YAML file states; none for an unknown optimizer.
+
+    The file is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
+    """
+    if not isinstance(optimizer, str):
+        return {}
+    path = shipped("optimizers").get(optimizer) or OPTIMIZERS.beside(optimizer, ".yaml")
+    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
+    return parameters

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.config import load_mapping, shipped_parameters
+from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.minimize import Run
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, shipped_parameters
 from accelcal_cli.schema import from_mapping
 
 ALL = "all"

@@ -6,8 +6,7 @@ import dataclasses
 import typing
 from typing import Any
 
-from accelcal_cli.config import shipped_parameters
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, shipped_parameters
 from accelcal_cli.table import Column, Table
 
 
