@@ -185,7 +185,7 @@ COMPARE = {
     "columns without file": (["--columns", "1,2,3"], ["--columns", "needs a file"]),
     "poses that determine no sensor": (
         ["flat.csv"],
-        ["flat.csv: there is no one least cost", "undetermined (The"],
+        ["flat.csv: there is no unique least cost", "undetermined (The"],
     ),
     "too few poses": (["few.csv"], ["few.csv", "3 poses", "at least 9"]),
     "word in a cell": (["word.csv"], ["word.csv, line 3", '"oops" is not a number']),
