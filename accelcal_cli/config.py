@@ -113,12 +113,3 @@ def dump(record: Mapping[str, Any]) -> str:
 def shipped(kind: str) -> dict[str, Path]:
     """Return the shipped files of a kind ("optimizers", "sensors", "studies") by name."""
     return {path.stem: path for path in sorted((CONFIGS / kind).glob("*.yaml"))}
-
-
-def shipped_parameters(optimizer: Any) -> dict[str, Any]:
-    """Return the settings that the shipped file of an optimizer states; none for an unknown one."""
-    files = shipped("optimizers")
-    if not isinstance(optimizer, str) or optimizer not in files:
-        return {}
-    parameters: dict[str, Any] = load_mapping(files[optimizer]).get("parameters") or {}
-    return parameters

@@ -19,7 +19,7 @@ def problem(readings: int) -> Loetters:
     K = np.diag(np.diagonal(sensor.model.K))
     half = np.concatenate([0.05 * np.diagonal(K), np.full(3, 0.06 * K.mean()), np.full(3, 0.1 * G * K.max())])
     blocks = ((N[first : first + 65536], None) for first in range(0, readings, 65536))
-    triangle = compress(blocks, N.mean(axis=0), float(np.ptp(N)) / 2)
+    triangle = compress(blocks, N.mean(axis=0)[None], np.array([np.ptp(N) / 2]), np.array([len(N)]))
     return Loetters(triangle, G, Box(pack(K, np.zeros(3), 9)[None], half[None]))
 
 

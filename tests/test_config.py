@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from accelcal_cli.config import dump, load_mapping, parse_mapping, read_text, shipped, shipped_parameters
+from accelcal_cli.config import dump, load_mapping, parse_mapping, read_text, shipped
 from accelcal_cli.errors import ConfigError
+from accelcal_cli.optimization.optimizer import shipped_parameters
 
 
 @pytest.mark.parametrize(

@@ -1,310 +1,38 @@
-"""A solution assessed: uncertainty, verdict, residuals and cautions.
+"""What is said of a fit: verdict, reasons, poses to add, and cautions of what speaks against the readings.
 
-What is said of one calibration: its verdict, the poses that would mend it, what a user should know.
-
-From dilution of precision, the walls of the box and the count of poses to the verdict and its reasons.
-
-What a user should know before trusting a calibration whose poses determine it: its residuals and its search.
-
-The verdict is of the poses alone: how an error of one reading comes out in the parameters. Cautions are of the
-readings: they do not change the verdict, and stand beside it.
+The verdict is of the poses: how an error of one reading comes out in the parameters. Cautions are of the readings and
+of the search: they do not change the verdict, and stand beside it. Arrays tell which sensors need words at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.calibration import observability as quality
-from accelcal_cli.calibration.box import Start
 from accelcal_cli.calibration.distributions import chi_square_chance
-from accelcal_cli.calibration.fit import NO_NOISE, Fit, covariance, examine, outliers
-from accelcal_cli.calibration.observability import Observabilities, Observability, Verdict
-from accelcal_cli.calibration.search import Solution, lower_problem, model_at, to_gain
-from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.temperature import SLOPES, Slopes
-from accelcal_cli.calibration.weights import beyond_scatter, explained, loss_weight, robust_variance
-from accelcal_cli.io.readings import Readings
-from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.sensor.poses import describe, faces
-
-
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """What is to be known of a solution beside its parameters.
-
-    Attributes:
-        low: the sensor in gauge `lower`.
-        freedom: degrees of freedom; s: standard deviation of one pose's modulus, m/s^2, NaN without any.
-        noise: s over what the scatter within poses predicts, and the chance of so large a ratio; None where not known.
-        covariance: of the nine parameters, (m/s^2)^2, shape (9, 9), NaN where they have no sigma.
-        judged: verdict and reasons; fit: residuals; outliers: numbers of the poses beyond chance.
-        cautions: sentences.
-    """
-
-    low: ErrorModel
-    freedom: int
-    s: float
-    noise: tuple[float | None, float | None]
-    covariance: Float
-    judged: Judgement
-    fit: Fit
-    outliers: tuple[int, ...]
-    cautions: tuple[str, ...]
-
-
-def assess(
-    readings: Readings,
-    settings: Settings,
-    start: Start,
-    solution: Solution,
-    found: ErrorModel,
-    before: ErrorModel,
-    weights: Float | None,
-    slopes: Slopes | None,
-) -> Assessment:
-    """Return the assessment of a solution.
-
-    Args:
-        readings: with slopes, those at the reference temperature.
-        settings, start, solution: of the calibration.
-        found: the sensor found, in the gauge of the search; before: what the readings were taken for.
-        weights: of the poses, shape (J,), or None.
-        slopes: with temperature, or None.
-    """
-    g, poses = settings.g, readings.poses
-    nine, point = lower_problem(solution.stated, found)
-    low = ErrorModel(*(a[0] for a in nine.parameters(point)))
-    information = quality.information(nine, point)[0] - (0.0 if slopes is None else slopes.loss)
-    held = None if settings.misalignment else quality.ALIGNED
-    seen = Observabilities.of(information[None], np.array([poses]), held)
-    freedom = poses - min(9, solution.problem.unknowns) - (0 if slopes is None else SLOPES)
-    judged = judge(solution, start, information, low, poses, freedom, held)
-    cofactor = _fitted(solution, found, seen.cofactor[0])
-    fit = examine(readings, low, before, g, cofactor, weights, _robust_weight(solution, settings), held)
-    variance = _variance(readings, settings, solution, low, weights, freedom)
-    spread = covariance(seen, np.array([variance]), np.array([judged.at_wall]), g)[0]
-    scale_sigma = float(np.sqrt(np.diagonal(spread)[quality.SCALE]).max()) / g
-    s = float(np.sqrt(variance))
-    noise = _noise(readings, low, s, freedom)
-    named = tuple(int(j) for j in outliers(fit.poses, poses, freedom))
-    where = [readings.where(j) for j in named]
-    left = 0.0 if settings.polish else to_gain(solution)
-    said = cautions(settings, solution.agreeing, left, s, freedom, scale_sigma, noise, where)
-    return Assessment(low, freedom, s, noise, spread, judged, fit, named, (*readings.cautions, *said))
-
-
-def _variance(
-    readings: Readings,
-    settings: Settings,
-    solution: Solution,
-    low: ErrorModel,
-    weights: Float | None,
-    freedom: int,
-) -> float:
-    """Return s^2 in (m/s^2)^2: sum w e^2 / (J - 9); NaN without degrees of freedom."""
-    if freedom < 1:
-        return float("nan")
-    if solution.noise:
-        return robust_variance(readings, low, settings.g, solution.noise, settings.robust, weights)
-    return solution.cost / (4.0 * settings.g**2) / freedom  # L = sum (2 g e)^2
-
-
-def _fitted(solution: Solution, found: ErrorModel, cofactor: Float) -> Float:
-    """Return (J^T W J)^-1 of the fit, shape (9, 9): with robust weights, which leverages and residuals rest on."""
-    if solution.reweighted_from is None:
-        return cofactor
-    nine, point = lower_problem(solution.problem, found)
-    return quality.Observability.of(quality.information(nine, point)[0], 0).cofactor
-
-
-def _robust_weight(solution: Solution, settings: Settings) -> Callable[[Float], Float] | None:
-    """Return the weight that the robust fit gave a residual in m/s^2; None when all counted alike."""
-    noise = solution.noise
-    if noise is None or noise <= NO_NOISE * settings.g:
-        return None
-    return lambda e: loss_weight(e / noise, settings.robust)
-
-
-def _noise(readings: Readings, low: ErrorModel, s: float, freedom: int) -> tuple[float | None, float | None]:
-    """Return s over the noise that the scatter within poses predicts, and the chance of so large a ratio."""
-    if readings.scatter is None or readings.count is None:
-        return None, None
-    u = low.specific_force(readings.output())
-    u = u / np.linalg.norm(u, axis=1, keepdims=True)
-    variance = explained(u, readings.scatter, readings.count, np.diagonal(low.K))
-    return beyond_scatter(s, float(np.mean(variance)), freedom)
-
-
-COMFORTABLE = 5.0
-"""Suggested poses bring every dilution of precision to this: half of what counts as weak."""
-
-MOST_SUGGESTIONS = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Judgement:
-    """What is said of a solution.
-
-    Attributes:
-        verdict: good, weak or undetermined.
-        reasons: why it is not good, in sentences; suggestions: poses that would mend it, in words.
-        information: J^T J that the words rest on, shape (9, 9).
-        dop: dilution of precision of the nine parameters by it, shape (9,).
-        sight: the sensor that the directions of the poses are seen with, gauge `lower`.
-        at_wall: the search stopped at a wall of its box: what it found is not the least-squares answer.
-    """
-
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    suggestions: tuple[str, ...]
-    information: Float
-    dop: Float
-    sight: ErrorModel
-    at_wall: bool
-
-
-def judge(
-    solution: Solution,
-    start: Start,
-    information: Float,
-    low: ErrorModel,
-    poses: int,
-    freedom: int,
-    held: Bool | None = None,
-) -> Judgement:
-    """Return the judgement of a solution.
-
-    Args:
-        solution: what was found from `start`.
-        information: J^T J of the nine parameters, shape (9, 9).
-        low: the sensor found, gauge `lower`.
-        poses: J; freedom: J less the parameters.
-        held: which of the nine are not estimated, shape (9,).
-    """
-    seen = Observability.of(information, poses, held)
-    said, first, sight = _first_sight(solution, start, information, seen, low, poses, held)
-    suggestions = _suggest(said, first, poses, held)
-    edge = edge_names(solution.x[0])
-    verdict = final_verdict(seen.verdict, bool(edge), freedom)
-    return Judgement(
-        verdict,
-        reasons_of(first, suggestions, edge, freedom, 9 if held is None else 9 - int(held.sum())),
-        suggestions,
-        said,
-        first.dop,
-        sight,
-        bool(edge),
-    )
-
-
-def _first_sight(
-    solution: Solution,
-    start: Start,
-    information: Float,
-    seen: Observability,
-    low: ErrorModel,
-    poses: int,
-    held: Bool | None,
-) -> tuple[Float, Observability, ErrorModel]:
-    """Return the information, the observability and the sensor that the verdict is explained with.
-
-    Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
-    nearest sphere then sees the attitudes better than the fit does.
-    """
-    if start.source != "sphere":
-        return information, seen, low
-    sphere = model_at(solution.problem, np.zeros_like(solution.x))
-    nine, point = lower_problem(solution.stated, sphere)
-    said = quality.information(nine, point)[0]
-    first = Observability.of(said, poses, held)
-    return (said, first, sphere) if first.verdict == "undetermined" else (information, seen, low)
-
-
-def _suggest(information: Float, seen: Observability, poses: int, held: Bool | None) -> tuple[str, ...]:
-    if seen.verdict == "good":
-        return ()
-    from accelcal_cli.calibration.observability import next_poses
-    from accelcal_cli.sensor.poses import fixture_directions
-
-    candidates = fixture_directions() if held is None else faces()
-    known = information if held is None else quality.knowing(information, held)
-    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
-    return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
-
-
-def notes(solution: Solution, start: Start, settings: Settings) -> tuple[str, ...]:
-    """Return what a user should know of the search, in sentences."""
-    lines = []
-    if start.source == "sphere":
-        lines.append("The readings fix no ellipsoid; the search started from the nearest sphere.")
-    if not np.isfinite(solution.search.cost).any():
-        lines.append(f"The {settings.optimizer} search failed; the result is the polished nominal sensor.")
-    return tuple(lines)
-
+from accelcal_cli.calibration.fit import Fit
+from accelcal_cli.calibration.observability import (
+    ALIGNED,
+    SCALE,
+    UNDETERMINED,
+    WEAK,
+    Observability,
+    Verdict,
+    information,
+    knowing,
+    next_poses,
+)
+from accelcal_cli.calibration.search import Solution, in_lower, rounding
+from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
 FEWEST_POSES = 12
 """Suggested poses bring a poor set to at least this many: nine fit exactly and say nothing of their noise."""
 
-EDGE = 1e-6
-"""A parameter within this part of a half-width from the wall of its box is at the edge."""
-
-
-def at_edge(x: Float) -> Bool:
-    """Return which unknowns are at a wall of the search box, shape (..., D), for points of the box, same shape.
-
-    Where they are, the least cost lies outside the box. In gauge `full` the free rotation reaches the walls of
-    the off-diagonals by itself, which says nothing.
-    """
-    edge: Bool = np.asarray(np.abs(x) >= 1.0 - EDGE)
-    if x.shape[-1] == 12:
-        edge[..., 3:9] = False
-    return edge
-
-
-def edge_names(x: Float) -> tuple[str, ...]:
-    """Return the names of the unknowns of a point, shape (D,), that are at a wall of the box."""
-    matrix = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: len(x) - 3]
-    return tuple(n for n, at in zip((*matrix, "D_1", "D_2", "D_3"), at_edge(x), strict=True) if at)
-
-
-def final_verdict(seen: Verdict, edge: bool, freedom: int) -> Verdict:
-    """Return the verdict of the poses, lowered where the search or the count of poses does not bear it out."""
-    if edge:
-        return "undetermined"
-    return "weak" if freedom == 0 and seen == "good" else seen
-
-
-def reasons_of(
-    seen: Observability,
-    suggestions: tuple[str, ...],
-    edge: tuple[str, ...],
-    freedom: int,
-    parameters: int = 9,
-) -> tuple[str, ...]:
-    """Return why a verdict is not good, in sentences; freedom is the number of poses less that of parameters."""
-    number = {6: "six", 9: "nine"}[parameters]
-    lines = list(quality.in_words(seen, suggestions))
-    if freedom < 0:
-        lines.insert(
-            0,
-            f"{parameters + freedom} poses are fewer than the {number} parameters; take at least {FEWEST_POSES}.",
-        )
-    if freedom == 0:
-        lines.append(
-            f"{number.capitalize()} poses leave nothing to judge their noise by: no sigma. "
-            f"Take at least {FEWEST_POSES}."
-        )
-    if edge and seen.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
-        lines.append(
-            f"The least cost lies outside the search box, beyond {', '.join(edge)}: "
-            "widen the box or state the nominal sensor (--config, keys box and nominal)."
-        )
-    return tuple(lines)
-
+COMFORTABLE, MOST_SUGGESTIONS = 5.0, 8
+"""Suggested poses bring every dilution of precision to this, half of what counts as weak; and how many they are."""
 
 MORE_THAN_NOISE, SURELY = 2.0, 1e-3
 """Residuals this many times their noise, and by chance this rarely, are told of."""
@@ -320,8 +48,8 @@ LARGE = 0.005
 0.5 % of full scale, and the real recordings of the tests leave 0.01 to 0.04 %."""
 
 PERPENDICULAR = (
-    "The axes were taken as perpendicular, no misalignment was estimated: one of 10 mrad, usual in low-cost sensors, "
-    "moves 1 % of the force along one axis to another."
+    "The axes were taken as perpendicular, so no misalignment was estimated: one of 10 mrad, usual in low-cost "
+    "sensors, moves 1 % of the force along one axis to another."
 )
 
 STOPPED_SHORT = 0.01
@@ -336,33 +64,199 @@ minimises E (1 - c^2 |u + n|^2)^2, c^2 = E |u + n|^2 / E |u + n|^4 = (1 + 3 s^2)
 factor is 1 / c."""
 
 
-def cautions(
-    settings: Settings,
-    agreeing: int,
-    left: float,
-    s: float,
-    freedom: int,
-    sigma_scale: float,
-    noise: tuple[float | None, float | None],
-    outlying: Sequence[str],
-) -> tuple[str, ...]:
-    """Return the cautions of a solution, in sentences, the gravest first.
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """What is said of the fit of R sensors.
 
-    Args:
-        settings: of the calibration; agreeing: how many of its searches ended in the best minimum.
-        left: the part of the cost that one more step would take off.
-        s: standard deviation of one pose's modulus, in the unit of g, NaN where nothing tells it; freedom: of it.
-        sigma_scale: the largest of a scale factor, as a part of it.
-        noise: s over what the scatter within poses predicts, and the chance of so large a ratio; None where nothing
-            tells them.
-        outlying: the poses that do not fit, by line or label.
+    Attributes:
+        fit: what it is said of.
+        verdicts: good, weak or undetermined, R of them; reasons: why one is not good, in sentences.
+        suggestions: poses to add, in words.
+        cautions: what speaks against the readings or the search, in sentences, the gravest first.
+        outliers: numbers of the poses beyond chance, from 0.
+        dop, information: what the words rest on, shapes (R, p) and (R, 9, 9).
+        sight: K and D, gauge `lower`, that the directions of the poses are seen with, shapes (R, 3, 3) and (R, 3).
     """
-    return (
-        *not_fitting(outlying, freedom, robust=settings.robust == "none"),
+
+    fit: Fit
+    verdicts: list[Verdict]
+    reasons: list[tuple[str, ...]]
+    suggestions: list[tuple[str, ...]]
+    cautions: list[tuple[str, ...]]
+    outliers: list[tuple[int, ...]]
+    dop: Float
+    information: Float
+    sight: tuple[Float, Float]
+
+
+def assess(fit: Fit) -> Assessment:
+    """Assess a fit."""
+    walled: list[bool] = np.asarray(fit.at_wall.any(axis=1)).tolist()
+    verdicts = [
+        _final_verdict(verdict, wall, freedom)
+        for verdict, wall, freedom in zip(
+            fit.observability.verdicts, walled, fit.freedom.tolist(), strict=True
+        )
+    ]
+    views, dop, determined, sight = _first_sight(fit)
+    reasons: list[tuple[str, ...]] = [()] * len(verdicts)
+    suggestions = list(reasons)
+    for at, verdict in enumerate(verdicts):
+        if verdict != "good":
+            suggestions[at] = _suggestions(fit, views[at], determined[at], int(fit.sample.poses[at]))
+            reasons[at] = _reasons(fit, views[at], suggestions[at], at)
+    pose, outlier = fit.residuals.pose, fit.residuals.outlier
+    outliers: list[tuple[int, ...]] = [()] * len(verdicts)
+    for at in np.flatnonzero(outlier.any(axis=1)).tolist():
+        outliers[at] = tuple(pose[at, outlier[at]].tolist())
+    cautions: list[tuple[str, ...]] = [()] * len(verdicts)
+    left = _to_gain(fit)
+    for at in np.flatnonzero(_may_have_cautions(fit, left)).tolist():
+        cautions[at] = _cautions(fit, at, float(left[at]), outliers[at])
+    return Assessment(fit, verdicts, reasons, suggestions, cautions, outliers, dop, determined, sight)
+
+
+def _final_verdict(poses: Verdict, walled: bool, freedom: int) -> Verdict:
+    """Return the verdict of the poses, lowered where the search or the count of poses does not bear it out."""
+    if walled:
+        return "undetermined"
+    return "weak" if freedom == 0 and poses == "good" else poses
+
+
+def _first_sight(fit: Fit) -> tuple[Observability, Float, Float, tuple[Float, Float]]:
+    """Return the observability that verdicts are explained with, dop and information of it, and the sensors' K and D.
+
+    Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
+    nearest sphere then sees the attitudes better than the fit does.
+    """
+    own = fit.observability, fit.dop, fit.information, (fit.lower, fit.D)
+    solution = fit.solution
+    if solution is None or "sphere" not in solution.stated.start.sources:
+        return own
+    held = None if fit.settings.misalignment else ALIGNED
+    K, D = solution.cost.parameters(np.zeros_like(solution.x))
+    determined = information(*in_lower(solution.plain, K, D))
+    views = Observability.of(determined, fit.sample.poses, held)
+    sphere = np.array([source == "sphere" for source in solution.stated.start.sources])
+    sphere &= np.array([verdict == "undetermined" for verdict in views.verdicts])
+    mixed = fit.observability.replaced(sphere, views)
+    own_K, own_D = np.where(sphere[:, None, None], K, fit.lower), np.where(sphere[:, None], D, fit.D)
+    kept = np.where(sphere[:, None, None], determined, fit.information)
+    return mixed, mixed.dop, kept, (own_K, own_D)
+
+
+def _suggestions(fit: Fit, view: Observability, determined: Float, poses: int) -> tuple[str, ...]:
+    """Return the poses that would bring a sensor to a good verdict, in words."""
+    if view.verdict == "good" or fit.solution is None:
+        return ()
+    whole = fit.settings.misalignment
+    candidates = fixture_directions() if whole else faces()
+    known = determined if whole else knowing(determined, ALIGNED)
+    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
+    return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
+
+
+def _reasons(fit: Fit, view: Observability, suggestions: Sequence[str], at: int) -> tuple[str, ...]:
+    """Return why the verdict on a sensor is not good, in sentences."""
+    known_attitudes = fit.solution is None
+    whose = "The known attitudes" if known_attitudes else "The poses"
+    lines = list(poorly_determined(view, suggestions, whose))
+    fewest = 6 if known_attitudes else FEWEST_POSES
+    freedom, poses = int(fit.freedom[at]), int(fit.sample.poses[at])
+    if freedom < 0:
+        needed = poses - freedom
+        words = {6: "six", 9: "nine"}.get(needed, str(needed))
+        lines.insert(0, f"{poses} poses are fewer than the {words} parameters; take at least {fewest}.")
+    if freedom == 0:
+        words = {4: "Four", 6: "Six", 9: "Nine"}.get(poses, str(poses))
+        lines.append(
+            f"{words} poses leave no degrees of freedom, so no uncertainty can be given. Take at least {fewest}."
+        )
+    beyond = ", ".join(edge_names(fit.at_wall[at]))
+    if beyond and view.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
+        lines.append(
+            f"The least cost lies outside the search box, beyond {beyond}: "
+            "widen the box or state the nominal sensor (--config, keys box and nominal)."
+        )
+    return tuple(lines)
+
+
+def poorly_determined(
+    view: Observability, suggestions: Sequence[str], whose: str = "The poses"
+) -> tuple[str, ...]:
+    """Return what is not determined, what is weak, and what to add, in sentences."""
+    lines = []
+    lost = view.above(UNDETERMINED)
+    if lost:
+        lines.append(f"{whose} do not determine: {', '.join(lost)}.")
+    elif view.rank < len(view.names):
+        lines.append(f"{whose} do not determine all nine parameters.")
+    weak = [name for name in view.above(WEAK) if name not in lost]
+    if weak:
+        lines.append(f"Weakly determined: {', '.join(weak)}.")
+    if lines and suggestions:
+        lines.append("Add these poses: " + "; ".join(suggestions) + ".")
+    return tuple(lines)
+
+
+def edge_names(at_wall: Bool) -> tuple[str, ...]:
+    """Return the names of the unknowns that are at a wall of the box, of those marked in shape (D,)."""
+    matrix = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: len(at_wall) - 3]
+    return tuple(n for n, at in zip((*matrix, "D_1", "D_2", "D_3"), at_wall, strict=True) if at)
+
+
+def _to_gain(fit: Fit) -> Float:
+    """Return the part of the cost that a Gauss-Newton step would take off, shape (R,); 0 after a polish."""
+    solution = fit.solution
+    if solution is None or fit.settings.polish:
+        return np.zeros(len(fit.sample))
+    return np.array([_gain(solution, at) for at in range(len(fit.sample))])
+
+
+def _gain(solution: Solution, at: int) -> float:
+    cost, x = solution.cost, solution.x[:, None]
+    if solution.value[at] <= rounding(cost)[at]:
+        return 0.0
+    residual, slope = cost.residuals(x)[at, 0], cost.jacobian(x)[at, 0]
+    step = np.linalg.lstsq(slope, residual)[0]
+    return float(np.sum((slope @ step) ** 2) / np.sum(residual**2))
+
+
+def _scale_sigma(fit: Fit) -> Float:
+    """Return the largest one-sigma of a scale factor, as a part of it, shape (R,)."""
+    sigma: Float = np.sqrt(np.einsum("rpp->rp", fit.covariance)[:, SCALE]).max(axis=1) / fit.settings.g
+    return sigma
+
+
+def _may_have_cautions(fit: Fit, left: Float) -> Bool:
+    """Return which sensors `_cautions` has something to say of, or might have, shape (R,)."""
+    g, s, settings = fit.settings.g, fit.s, fit.settings
+    noisy = (s > LARGE * g) | (NOISE_BIAS * (s / g) ** 2 > _scale_sigma(fit))
+    noisy |= s**2 >= MORE_THAN_NOISE**2 * fit.expected
+    searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
+    always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
+    found: Bool = noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always
+    return found
+
+
+def _cautions(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the cautions of a sensor, in sentences, the gravest first."""
+    readings, settings = fit.sample.readings(at), fit.settings
+    s, freedom = float(fit.s[at]), int(fit.freedom[at])
+    where = [readings.where(pose) for pose in outliers]
+    least_squares = settings.robust == "none" and fit.solution is not None
+    lines = [
+        *readings.cautions,
+        *not_fitting(where, freedom, robust=least_squares),
         *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
-        *_more_than_noise(*noise),
-        *_noise_bias(s, settings.g, sigma_scale),
-        *_search(agreeing, settings.runs, left),
+    ]
+    if fit.solution is None:
+        return (*lines, *_turned_round(fit.K[at]))
+    return (
+        *lines,
+        *more_than_noise(*fit.noise_ratio(at)),
+        *_noise_bias(s, settings.g, float(_scale_sigma(fit)[at])),
+        *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),
         *odd_gravity(settings.g),
     )
@@ -380,41 +274,42 @@ def large_residuals(s: float, g: float, freedom: int, *, aligned: bool = False) 
     """Return a caution of residuals that are large beside g.
 
     Args:
-        s, g: as in `cautions`; freedom: degrees of freedom of s.
+        s: standard deviation of one pose's modulus, in the unit of g, NaN where nothing tells it.
+        g: local gravity; freedom: degrees of freedom of s.
         aligned: whether the axes were taken as perpendicular, which may be what the residuals say.
     """
     if not is_large(s, g, freedom):
         return ()
-    other = ", or its axes are not perpendicular" if aligned else ""
+    other = ", or the axes are not perpendicular" if aligned else ""
     return (
-        f"After calibration one pose errs by {s / g:.2%} of g, where {LARGE:.1%} is much for an accelerometer at rest: "
-        f"the sensor moved, the readings are averaged too little, or they are not what they are taken for{other}.",
+        f"Residuals are too large: a typical pose is off by {s / g:.2%} of g (above {LARGE:.1%} is suspicious). Either "
+        "the sensor moved, too few readings were averaged, or the rows are not static poses" + other + ".",
     )
 
 
-def not_fitting(outlying: Sequence[str], freedom: int, *, robust: bool = False) -> tuple[str, ...]:
+def not_fitting(outliers: Sequence[str], freedom: int, *, robust: bool = False) -> tuple[str, ...]:
     """Return a caution that names the poses that do not fit, and what to do.
 
     Args:
-        outlying: the poses, by line or label.
+        outliers: the poses, by line or label.
         freedom: degrees of freedom: with few, a sound pose can take the blame of another.
         robust: whether a robust loss is a way out.
     """
-    if not outlying:
+    if not outliers:
         return ()
-    other = ", or use calibrate --robust" if robust else ""
-    doubt = (
-        " With so few poses one can take the blame of another."
-        if freedom <= FEW and len(outlying) > 1
-        else ""
-    )
-    named = ", ".join(outlying[:MOST_NAMED])
-    more = f" and {len(outlying) - MOST_NAMED:,} more" if len(outlying) > MOST_NAMED else ""
-    again = "it" if len(outlying) == 1 else "them"
-    return (f"Beyond chance off the others: {named}{more}. Measure {again} again{other}.{doubt}",)
+    named = ", ".join(outliers[:MOST_NAMED])
+    if len(outliers) > MOST_NAMED:
+        named += f" and {len(outliers) - MOST_NAMED:,} more"
+    one = len(outliers) == 1
+    subject = f"Outlier: {named} does" if one else f"Outliers: {named} do"
+    again = f"Measure {'it' if one else 'them'} again" + (" or add --robust huber" if robust else "")
+    blame = freedom <= FEW and not one
+    doubt = " With so few poses one can take the blame of another." if blame else ""
+    return (f"{subject} not fit the other poses (p < 0.01). {again}.{doubt}",)
 
 
-def _more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
+def more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
+    """Return a caution of residuals of so many times the noise that the scatter predicts, and its p-value."""
     if ratio is None or chance is None or ratio < MORE_THAN_NOISE or chance > SURELY:
         return ()
     return (
@@ -434,16 +329,16 @@ def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:
     if not bias > sigma_scale:
         return ()
     return (
-        f"The noise of one reading, {s:.3g}, is so large that it makes the scale factors about {bias:.1%} too "
-        "large, more than their sigma: average the readings of each pose first (a column that labels the pose).",
+        f"The noise of one reading, {s:.3g}, makes the scale factors about {bias:.1%} too large, more than their "
+        "sigma. Average the readings of each pose first (a column that labels the pose).",
     )
 
 
-def _search(agreeing: int, runs: int, left: float) -> tuple[str, ...]:
+def _unfinished(agreeing: int, runs: int, left: float) -> tuple[str, ...]:
     lines = []
     if left > STOPPED_SHORT:
         lines.append(
-            f"The search stopped short of the minimum: a step more would take {left:.0%} off the cost. "
+            f"The search stopped short of the minimum: one more step would take {left:.0%} off the cost. "
             "Leave out --no-polish, or search longer."
         )
     if agreeing < runs:
@@ -458,4 +353,15 @@ def odd_gravity(g: float) -> tuple[str, ...]:
     return (
         f"g = {g:g} is neither gravity on Earth, {EARTH[0]} to {EARTH[1]} m/s^2, nor 1, for readings in units of g: "
         "scale factors are proportional to it.",
+    )
+
+
+def _turned_round(K: Float) -> tuple[str, ...]:
+    """Return a caution of a sensor whose axes all point to the other end of their own, K of shape (3, 3)."""
+    sizes = np.sqrt(np.diagonal(K @ K.T))
+    if not (np.diagonal(K) < -0.5 * sizes).all():
+        return ()
+    return (
+        "All scale factors are negative: the reference, or the sensor, counts gravity instead of specific force, which "
+        "at rest points up.",
     )

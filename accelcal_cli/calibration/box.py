@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.observability import Observabilities, information
+from accelcal_cli.calibration.observability import Observability, information
 from accelcal_cli.calibration.problem import Box, Loetters, Triangle, fit_ellipsoid, pack
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.sensor.model import ErrorModel, to_gauge
-
-"""Stream of the random shift of the box, apart from the searches' own streams."""
+from accelcal_cli.sensor.model import to_gauge
 
 SHIFT = 0.5
 """The box is moved off the closed form by up to this part of its half-width: the search finds the answer by
@@ -91,7 +89,7 @@ def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
 def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> Bool:
     """Whether the poses determine what the closed form says, shape (R,); where they do not, noise has decided it."""
     problem = Loetters(triangle, settings.g, _box(K, D, settings, 9))
-    seen = Observabilities.of(information(problem, np.zeros((len(K), 9))), triangle.poses)
+    seen = Observability.of(information(problem, np.zeros((len(K), 9))), triangle.poses)
     return np.array([verdict != "undetermined" for verdict in seen.verdicts], dtype=bool)
 
 
@@ -119,24 +117,15 @@ def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Floa
     return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
 
 
-def nominal_before(scale: float, D: Float, settings: Settings) -> tuple[str, ErrorModel]:
-    """Return what the readings are taken for before calibration, in words and as a model.
+def uncalibrated(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:
+    """Return scale factors and biases, shape (R, 3), that readings have before calibration, and the same in words.
 
-    A stated nominal sensor; else, for readings that are specific force already, themselves; else one scale
-    factor for all axes and the bias in the middle, which is what a user without calibration could do.
+    A stated nominal sensor; else, for readings that are specific force already, themselves; else one scale factor for
+    all axes and the bias in the middle, which is what a user without calibration could do.
 
     Args:
-        scale: mean scale factor, output units per m/s^2; D: bias, output units, shape (3,).
+        scale: mean scale factor, output units per m/s^2, shape (R,); D: bias, output units, shape (R, 3).
         settings: may state a nominal sensor.
-    """
-    k, bias, words = taken_for(np.array([scale]), D[None], settings)
-    return words[0], ErrorModel(np.diag(k[0]), bias[0])
-
-
-def taken_for(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:
-    """Return scale factors and biases, shape (R, 3), and words of what readings of R sensors are taken for.
-
-    See `nominal_before`; scale has the shape (R,), D (R, 3).
     """
     if settings.nominal is not None:
         k, bias = (np.broadcast_to(v, D.shape) for v in (settings.nominal.scale, settings.nominal.bias))

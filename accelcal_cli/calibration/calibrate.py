@@ -1,37 +1,34 @@
-"""The road from readings to a calibration: nominal, search, polish, uncertainty, verdict.
+"""The flow from readings to calibrations: Readings -> problem -> Solution -> Fit -> Assessment -> Calibration.
 
-From a solution to the record.
+Every stage takes one object, of R sensors at once, and returns one; a single sensor is R = 1.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 
 from accelcal_cli import __version__
-from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.assess import assess, notes
-from accelcal_cli.calibration.box import Start, nominal_before
-from accelcal_cli.calibration.fit import Fit, propagate
-from accelcal_cli.calibration.problem import Loetters
+from accelcal_cli.calibration.assess import Assessment, assess
+from accelcal_cli.calibration.fit import fit
+from accelcal_cli.calibration.known_attitudes import fit_known
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
-from accelcal_cli.calibration.search import (
-    Solution,
-    model_at,
-    opened,
-    packed,
-    resolve,
-    reweight,
-    search,
-    shared_weights,
-)
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.temperature import Slopes, fit
-from accelcal_cli.calibration.weights import pose_weights
+from accelcal_cli.calibration.temperature import with_slopes
+from accelcal_cli.calibration.weights import NEEDS, without_weights
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import ErrorModel
+
+CURVE_POINTS = 120
+"""Points kept of the convergence curve."""
+
+TOGETHER = 16_384
+"""Poses that are calibrated at once, unless one sensor has more: few enough for the processor's caches."""
 
 
 def calibrate(readings: Readings, settings: Settings) -> Calibration:
@@ -42,155 +39,175 @@ def calibrate(readings: Readings, settings: Settings) -> Calibration:
         settings: model, box, optimizer, robustness.
 
     Raises:
-        DataError: readings without any information (all equal, fewer than two).
+        DataError: readings without any information (all equal, fewer than two), or without the weights asked for.
         ConfigError: unknown optimizer or parameter.
     """
+    return calibrate_many([readings], settings)[0]
+
+
+def calibrate_many(readings: Sequence[Readings], settings: Settings) -> list[Calibration]:
+    """Calibrate sensors; each comes out as it would alone, to the last bit, and sensors with as many poses are faster.
+
+    Args:
+        readings: static poses of each sensor; settings: of all of them.
+
+    Raises:
+        DataError, ConfigError: as in `calibrate`; the message names the sensor.
+    """
+    results: list[Calibration | None] = [None] * len(readings)
+    for group in _groups(readings, settings):
+        sample = Sample.of([readings[at] for at in group])
+        for at, fault in zip(group, faults(sample, settings), strict=True):
+            if fault:
+                raise DataError(f"{readings[at].source}: {fault}")
+        assessment = assessed(sample, settings)
+        for place, at in enumerate(group):
+            results[at] = record(assessment, place)
+    return [result for result in results if result is not None]
+
+
+def _groups(readings: Sequence[Readings], settings: Settings) -> list[list[int]]:
+    """Return which sensors are calibrated together: as many poses, the same columns, and settings that go with it."""
+    alone = settings.robust != "none" or settings.weights == "auto" or settings.attitudes == "known"
+    groups: dict[object, list[list[int]]] = {}
+    for at, one in enumerate(readings):
+        columns = tuple(part is None for part in (one.count, one.scatter, one.reference))
+        own = alone or one.temperature is not None or one.poses > TOGETHER
+        parts = groups.setdefault(at if own else (one.poses, columns), [[]])
+        if (len(parts[-1]) + 1) * one.poses > TOGETHER and parts[-1]:
+            parts.append([])
+        parts[-1].append(at)
+    return [part for parts in groups.values() for part in parts]
+
+
+def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Assessment:
+    """Take a sample without faults through the flow; `closed` as in `search`."""
     if settings.attitudes == "known":
-        from accelcal_cli.calibration.known_attitudes import calibrate_known
+        return assess(fit_known(sample, settings))
+    return assess(fit(with_slopes(reweight(search(state(sample, settings), closed=closed)))))
 
-        return calibrate_known(readings, settings)
-    if readings.poses < 2 or not (readings.upper > readings.lower).any():
-        raise DataError(f"{readings.source}: all readings are equal; expected poses that differ in attitude")
-    shared = settings.weights == "auto"
-    weights = shared_weights(readings, settings) if shared else pose_weights(readings, settings.weights)
-    problem, start = opened(readings, settings, weights)
-    solution = search(problem, settings)
-    if settings.robust != "none":
-        solution = reweight(solution, readings, settings, weights)
-    if readings.reference is not None:
-        readings = noted(
-            readings, "The columns of a reference specific force are used with --attitudes known only."
+
+def faults(sample: Sample, settings: Settings) -> list[str]:
+    """Return why each sensor cannot be calibrated, in a sentence, or nothing."""
+    words = [""] * len(sample)
+    for at in np.flatnonzero(without_weights(sample, settings.weights)).tolist():
+        words[at] = f"--weights {settings.weights} needs {NEEDS[settings.weights]}"
+    for at in np.flatnonzero(~(sample.upper > sample.lower).any(axis=1)).tolist():
+        poses = int(sample.poses[at])
+        words[at] = (
+            f"nothing to calibrate: {'only one pose' if poses == 1 else f'all {poses} poses are equal'}"
         )
-    if readings.temperature is None or not settings.temperature:
-        return assemble(readings, settings, start, solution, weights)
-    slopes, note = _slopes(readings, solution, settings, weights)
-    if slopes is None:
-        return assemble(noted(readings, note), settings, start, solution, weights)
-    warmed = packed(slopes.readings, weights, within=readings)
-    solution = resolve(solution, Loetters(warmed, settings.g, start.box))
-    return assemble(noted(slopes.readings, note), settings, start, solution, weights, slopes)
+    return words
 
 
-def noted(readings: Readings, note: str) -> Readings:
-    """Return readings with one more note."""
-    return replace(readings, notes=(*readings.notes, note))
-
-
-def _slopes(
-    readings: Readings, solution: Solution, settings: Settings, weights: Float | None
-) -> tuple[Slopes | None, str]:
-    """Return the slopes with temperature, if the readings determine them, and a sentence about it."""
-    if settings.robust != "none":
-        return None, "Temperature column not used: slopes with temperature go with plain least squares only."
-    if not settings.misalignment:
-        return (
-            None,
-            "Temperature column not used: slopes with temperature are fitted beside misalignments only.",
-        )
-    return fit(readings, model_at(solution.problem, solution.x), settings.g, weights)
-
-
-CURVE_POINTS = 120
-"""Points kept of the convergence curve."""
-
-
-def assemble(
-    readings: Readings,
-    settings: Settings,
-    start: Start,
-    solution: Solution,
-    weights: Float | None,
-    slopes: Slopes | None = None,
-) -> Calibration:
-    """Return the calibration record of a solution; with slopes, `readings` are those at the reference temperature."""
-    found = model_at(solution.problem, solution.x)
-    shown = found.in_gauge(settings.gauge)
-    centre = start.box.centre[0]
-    before, before_model = nominal_before(float(centre[:3].mean()), centre[-3:], settings)
-    seen = assess(readings, settings, start, solution, found, before_model, weights, slopes)
-    judged, fit = seen.judged, seen.fit
-    sigma_K, sigma_D = propagate(shown.K, seen.low.K, seen.covariance, settings.gauge, settings.g)
+def record(assessment: Assessment, at: int) -> Calibration:
+    """Return the record of the sensor number `at` of an assessment."""
+    fit, dop = assessment.fit, assessment.dop[at]
+    settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
+    K = fit.K[at]
+    K_A = np.linalg.inv(K)
+    ratio, chance = fit.noise_ratio(at)
+    solution = fit.solution
+    unused = solution is not None and readings.reference is not None
+    reference = ("The columns of a reference specific force are used with --attitudes known only.",)
     return Calibration(
-        K_a=shown.K,
-        D_a=shown.D,
-        K_A=shown.K_A,
-        f_0=shown.f_0,
-        gauge=settings.gauge,
-        sigma=Sigma(sigma_K, sigma_D),
-        dop=Dop.of(judged.dop),
-        verdict=judged.verdict,
-        reasons=judged.reasons,
-        suggestions=judged.suggestions,
-        cautions=seen.cautions,
-        cost_search=float(solution.search.cost[solution.best]),
-        cost=solution.cost,
-        rms=fit.rms,
-        rms_before=fit.rms_before,
-        before=before,
-        s=seen.s,
-        freedom=seen.freedom,
-        noise_ratio=seen.noise[0],
-        noise_chance=seen.noise[1],
-        covariance=seen.covariance,
-        information=judged.information,
-        nominal_scale=np.diagonal(before_model.K).copy(),
+        K_a=K,
+        D_a=fit.D[at],
+        K_A=K_A,
+        f_0=K_A @ fit.D[at],
+        gauge=fit.gauge,
+        sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
+        dop=Dop.of(dop),
+        verdict=assessment.verdicts[at],
+        reasons=assessment.reasons[at],
+        suggestions=assessment.suggestions[at],
+        cautions=assessment.cautions[at],
+        cost_search=float(search.cost[at]),
+        cost=float(fit.value[at]),
+        rms=float(fit.rms[at]),
+        rms_before=float(fit.rms_before[at]),
+        before=fit.before[at],
+        s=float(fit.s[at]),
+        freedom=int(fit.freedom[at]),
+        noise_ratio=ratio,
+        noise_chance=chance,
+        covariance=fit.covariance[at],
+        information=assessment.information[at],
+        nominal_scale=np.array(fit.nominal[at]),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
-        poses=readings.poses,
-        evaluations=solution.evaluations,
-        runs=settings.runs,
-        runs_agreeing=solution.agreeing,
-        poses_fit=_pose_fits(readings, fit, seen.low, judged.sight),
-        outliers=seen.outliers,
-        convergence=_curve(solution),
-        optimizer=settings.optimizer,
-        settings=_settings_record(settings, start),
+        poses=int(fit.sample.poses[at]),
+        evaluations=int(search.evaluations[at]),
+        runs=search.runs,
+        runs_agreeing=int(search.agreeing[at]),
+        poses_fit=_pose_fits(assessment, at),
+        outliers=assessment.outliers[at],
+        convergence=_curve(search, at),
+        optimizer=search.optimizer,
+        settings=_settings_record(assessment, at),
         g=settings.g,
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
-        notes=(*readings.notes, *notes(solution, start, settings)),
+        notes=(*readings.notes, *(reference if unused else ()), *fit.notes, *_notes(assessment, at)),
         version=__version__,
-        temperature=None if slopes is None else slopes.temperature,
+        temperature=None if solution is None or solution.slopes is None else solution.slopes.temperature,
     )
 
 
-def _pose_fits(readings: Readings, fit: Fit, low: ErrorModel, sight: ErrorModel) -> tuple[PoseFit, ...]:
-    r = fit.poses
-    force = sight.specific_force(low.output(r.force))
+def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:
+    fit, readings = assessment.fit, assessment.fit.sample.readings(at)
+    residuals, (K, D) = fit.residuals, assessment.sight
+    real = residuals.real[at]
+    output = ErrorModel(fit.lower[at], fit.D[at]).output(residuals.force[at, real])
+    force = ErrorModel(K[at], D[at]).specific_force(output)
     directions = (force / np.linalg.norm(force, axis=1, keepdims=True)).tolist()
     return tuple(
         PoseFit(
-            int(j),
-            readings.where(int(j)),
-            float(r.error[i]),
-            float(r.studentised[i]),
-            float(r.leverage[i]),
-            float(r.left_out[i]),
-            float(r.before[i]),
-            tuple(directions[i]),
+            pose=int(pose),
+            where=readings.where(int(pose)),
+            residual=float(residuals.error[at, k]),
+            studentised=float(residuals.studentised[at, k]),
+            leverage=float(residuals.leverage[at, k]),
+            left_out=float(residuals.left_out[at, k]),
+            residual_before=float(residuals.before[at, k]),
+            direction=tuple(direction),
         )
-        for i, j in enumerate(r.pose)
+        for k, (pose, direction) in enumerate(zip(residuals.pose[at, real], directions, strict=True))
     )
 
 
-def _curve(solution: Solution) -> tuple[tuple[int, float], ...]:
+def _curve(search: Search, at: int) -> tuple[tuple[int, float], ...]:
     """Return the best run's best cost so far against its evaluations, thinned."""
-    search = solution.search
-    if search.trace is None or search.trace_evaluations is None:
+    run, best = search.run, search.best
+    if run is None or best is None or run.trace is None or run.trace_evaluations is None:
         return ()
-    last = int(search.iterations[solution.best]) + 1
-    keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, CURVE_POINTS))})
-    counts, costs = search.trace_evaluations[solution.best][keep], search.trace[solution.best][keep]
+    row = int(best[at])
+    last = int(run.iterations[row]) + 1
+    kept = sorted({round(k) for k in np.linspace(0, last - 1, min(last, CURVE_POINTS))})
+    counts, costs = run.trace_evaluations[row][kept], run.trace[row][kept]
     return tuple((int(n), float(cost)) for n, cost in zip(counts, costs, strict=True) if np.isfinite(cost))
 
 
-def _settings_record(settings: Settings, start: Start) -> dict[str, object]:
+def _settings_record(assessment: Assessment, at: int) -> dict[str, object]:
     """Return the settings as stated, with the optimizer's parameters and the box filled in."""
-    record = asdict(settings)
-    record["parameters"] = asdict(settings.build_optimizer())
-    record["box"] = {
-        **asdict(settings.box),
-        "centre": start.box.centre[0].tolist(),
-        "half_width": start.box.half[0].tolist(),
-        "source": start.source,
-    }
-    record["version"] = __version__
-    return record
+    settings, solution = assessment.fit.settings, assessment.fit.solution
+    stated = asdict(settings)
+    if solution is not None:
+        start = solution.stated.start
+        stated["parameters"] = asdict(settings.build_optimizer())
+        stated["box"] = {
+            **asdict(settings.box),
+            "centre": start.box.centre[at].tolist(),
+            "half_width": start.box.half[at].tolist(),
+            "source": start.sources[at],
+        }
+    return {**stated, "version": __version__}
+
+
+def _notes(assessment: Assessment, at: int) -> tuple[str, ...]:
+    """Return what a user should know of the search, in sentences."""
+    solution, search = assessment.fit.solution, assessment.fit.search
+    lines = []
+    if solution is not None and solution.stated.start.sources[at] == "sphere":
+        lines.append("The readings fix no ellipsoid; the search started from the nearest sphere.")
+    if not np.isfinite(search.cost[at]):
+        lines.append(f"The {search.optimizer} search failed; the result is the polished nominal sensor.")
+    return tuple(lines)

@@ -1,36 +1,37 @@
-"""Residuals pose by pose: fit, leverage, leave-one-out error, outliers.
+"""A fit: residuals pose by pose, what the poses determine, noise and covariance, computed once for all sensors.
 
-Fits that leave one pose out: what a pose looks like to the others, without the first-order formula.
-
-The formula of linear regression subtracts a pose's part from the sum of squares. A pose that is wrong by several per
-cent bends the fit so far that its part comes out larger than the whole, and the formula has nothing to say of it.
-
-From the noise of a pose to the one-sigma of the parameters: where it holds, and what it is in each gauge.
-
-The nine parameters are those of `quality`.
+Everything is in gauge `lower` and of the nine parameters of `observability`, whatever is searched or printed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.distributions import student_chance
-from accelcal_cli.calibration.observability import BIAS, Observabilities, Verdict, design
+from accelcal_cli.calibration.box import uncalibrated
+from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
+from accelcal_cli.calibration.observability import (
+    ALIGNED,
+    BIAS,
+    Observability,
+    Verdict,
+    design,
+    information,
+)
 from accelcal_cli.calibration.problem import ROWS_COLUMNS
-from accelcal_cli.io.readings import Readings
-from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution, in_lower, modulus_errors
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.weights import explained, loss_slope, loss_weight
+from accelcal_cli.sensor.model import Gauge, to_gauge
 
 KEPT = 1000
-"""Poses whose residuals a result keeps one by one; of more, the worst KEPT_WORST."""
+"""Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""
 
 KEPT_WORST = 20
-
-NO_NOISE = 1e-12
-"""Residuals, or their standard deviation, below this part of g are rounding."""
 
 SUSPECT = 3.0
 """Studentised residuals beyond this may be outliers: those of Student's t with any freedom are as large at least."""
@@ -41,143 +42,288 @@ BENT = 0.01
 OUTLIER_LEVEL = 0.01
 """Chance of naming an outlier among all poses where there is none (Bonferroni over the poses)."""
 
+EDGE = 1e-6
+"""A parameter within this part of a half-width from the wall of its box is at the edge."""
+
+STEPS, SETTLED = 12, 1e-6
+"""Gauss-Newton steps at most of a fit without a pose, and the part of g below which a step is the last: the next would
+be its square."""
+
+LEAST_ROOM = 1e-8
+"""The trace of a matrix times that of its inverse is below 1 over this where the other poses determine a sensor."""
+
+RIDGE = 1e-14
+"""Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
+
 
 @dataclass(frozen=True, eq=False)
 class PoseResiduals:
-    """Residuals of chosen poses.
+    """Residuals of k poses of each of R sensors.
 
     Attributes:
-        pose: their numbers, from 0, shape (k,).
-        error, before: |f| - g after and before calibration, m/s^2, shape (k,).
-        force: calibrated specific force, gauge `lower`, m/s^2, shape (k, 3).
-        leverage: part of the pose's own residual that the fit absorbs, shape (k,).
-        studentised: residual over its standard deviation from the other poses, shape (k,).
-        left_out: |f| - g, m/s^2, that a fit without the pose would show, shape (k,), to first order.
+        pose: their numbers, from 0, shape (R, k); real: which are no repetitions, shape (R, k).
+        error, before: |f| - g after and before calibration, m/s^2, shape (R, k).
+        force: calibrated specific force, gauge `lower`, m/s^2, shape (R, k, 3).
+        leverage: part of the pose's own residual that the fit absorbs, shape (R, k).
+        studentised: residual over its standard deviation from the other poses, shape (R, k).
+        left_out: |f| - g, m/s^2, that a fit without the pose would show, shape (R, k).
+        outlier: whether the studentised residual is beyond chance, shape (R, k).
     """
 
     pose: Int
+    real: Bool
     error: Float
     before: Float
     force: Float
     leverage: Float
     studentised: Float
     left_out: Float
+    outlier: Bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
-    """Sums over all poses, and the poses that are kept.
+    """What R sensors are found to be, and how well their readings say so.
 
     Attributes:
-        rms, rms_before: of |f| - g after and before calibration, m/s^2.
-        poses: the residuals that are kept, in the order of the poses.
+        sample: the readings that were fitted; settings: of the calibration; search: how it was found.
+        gauge: of K; K, D: the sensors, shapes (R, 3, 3) and (R, 3); lower: K in gauge `lower`.
+        sigma_K, sigma_D: one-sigma of K and D, NaN where there is none.
+        value: L, shape (R,), (m/s^2)^4.
+        observability: what the poses say of the parameters, which the verdict rests on.
+        dop: dilution of precision of the nine parameters, shape (R, 9); information: J^T J of them, shape (R, 9, 9).
+        freedom: degrees of freedom, shape (R,).
+        s: standard deviation of one pose's modulus (with known attitudes of one axis), m/s^2, NaN without freedom,
+            shape (R,).
+        covariance: of the nine parameters, (m/s^2)^2, shape (R, 9, 9), NaN where it does not hold.
+        at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
+        rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
+            nominal: scale factors before, shape (R, 3).
+        residuals: pose by pose.
+        expected: variance of one pose that the scatter within the poses explains, (m/s^2)^2, shape (R,), or NaN.
+        solution: what was fitted; None with known attitudes.
+        notes: of the solution, in sentences.
     """
 
-    rms: float
-    rms_before: float
-    poses: PoseResiduals
+    sample: Sample
+    settings: Settings
+    search: Search
+    gauge: Gauge
+    K: Float
+    D: Float
+    lower: Float
+    sigma_K: Float  # noqa: N815
+    sigma_D: Float  # noqa: N815
+    value: Float
+    observability: Observability
+    dop: Float
+    information: Float
+    freedom: Int
+    s: Float
+    covariance: Float
+    at_wall: Bool
+    rms: Float
+    rms_before: Float
+    before: list[str]
+    nominal: Float
+    residuals: PoseResiduals
+    expected: Float
+    solution: Solution | None = None
+    notes: tuple[str, ...] = ()
+
+    def noise_ratio(self, at: int) -> tuple[float | None, float | None]:
+        """Return s of a sensor over the noise that its scatter predicts, and the p-value of so large a ratio."""
+        s, expected, freedom = float(self.s[at]), float(self.expected[at]), int(self.freedom[at])
+        if freedom < 1 or not s > 0 or not expected > 0:
+            return None, None
+        ratio = s / float(np.sqrt(expected))
+        return ratio, float(chi_square_chance(np.array([freedom * ratio**2]), np.array([freedom]))[0])
 
 
-def modulus_errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[tuple[int, Float, Float]]:
-    """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f in m/s^2, shapes (B,) and (B, 3)."""
-    for first, block in readings.blocks():
-        f = model.specific_force(block)
-        yield first, (g * g - np.einsum("ij,ij->j", f.T, f.T)) / (2.0 * g), f
+def fit(solution: Solution) -> Fit:
+    """Fit a solution: one pass over the readings, everything for all sensors at once."""
+    settings, sample = solution.stated.settings, solution.sample
+    g = settings.g
+    held = None if settings.misalignment else ALIGNED
+    K, D = solution.cost.parameters(solution.x)
+    nine, point = in_lower(solution.plain, K, D)
+    lower, own_D = nine.parameters(point)
+    found = information(nine, point)
+    if solution.slopes is not None:
+        found = found - solution.slopes.loss
+    observability = Observability.of(found, sample.poses, held)
+    slopes = 0 if solution.slopes is None else SLOPES
+    freedom = sample.poses - min(9, solution.cost.unknowns) - slopes
+    cofactor = observability.cofactor
+    if solution.noise is not None:  # leverages rest on the robust weights, too
+        cofactor = Observability.of(information(*in_lower(solution.cost, K, D)), 0).cofactor
+    reading = _pass(solution, lower, own_D)
+    residuals = _residuals(reading, sample, cofactor, freedom, held, g)
+    variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
+    at_wall = _at_wall(solution.x)
+    covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
+    shown = to_gauge(K, settings.gauge)
+    sigma_K, sigma_D = propagate(shown, lower, covariance, settings.gauge, g)
+    return Fit(
+        sample=sample,
+        settings=settings,
+        search=solution.search,
+        gauge=settings.gauge,
+        K=shown,
+        D=D,
+        lower=lower,
+        sigma_K=sigma_K,
+        sigma_D=sigma_D,
+        value=solution.value,
+        observability=observability,
+        dop=observability.dop,
+        information=found,
+        freedom=freedom,
+        s=np.sqrt(variance),
+        covariance=covariance,
+        at_wall=at_wall,
+        rms=np.sqrt(reading.sums[0] / sample.poses),
+        rms_before=np.sqrt(reading.sums[1] / sample.poses),
+        before=reading.words,
+        nominal=reading.nominal,
+        residuals=residuals,
+        expected=reading.sums[2] / sample.poses,
+        solution=solution,
+        notes=solution.notes,
+    )
 
 
-def square_error(e: Float, g: float) -> float:
-    """Return the sum of (|f| - g)^2 in (m/s^2)^2 from e, shape (B,)."""
-    error = length_error(e, g)
-    return float(np.sum(error * error))
+def _at_wall(x: Float) -> Bool:
+    """Return which unknowns are at a wall of the search box, shape (R, D), for points of the box, same shape.
+
+    Where they are, the least cost lies outside the box. In gauge `full` the free rotation reaches the walls of the
+    off-diagonals by itself, which says nothing.
+    """
+    edge: Bool = np.asarray(np.abs(x) >= 1.0 - EDGE)
+    if x.shape[-1] == 12:
+        edge[..., 3:9] = False
+    return edge
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """What one pass over the readings leaves, per sensor, and of the poses that are kept.
+
+    Attributes:
+        sums: over the poses, shape (6, R), of (|f| - g)^2 after and before, of the variance that scatter explains, of
+            w e^2 (weights of a robust loss and all), and of psi^2, all (m/s^2)^2, and psi' under a robust loss.
+        columns: of the kept poses: number, sqrt(w) e, w, f and e before, shapes (R, k) and (R, k, 3).
+        words, nominal: what the readings were taken for, and the scale factors of that.
+    """
+
+    sums: Float
+    columns: list[Float]
+    words: list[str]
+    nominal: Float
+
+    def variance(self, solution: Solution, freedom: Int) -> Float:
+        """Return s^2, (m/s^2)^2, shape (R,): sum w e^2 over the degrees of freedom.
+
+        Under a robust loss the factor of (J^T W J)^-1 in the covariance of the M-estimate [huber1981]:
+        sum psi^2 / (J - p) / (mean psi')^2, W the weights of the poses without those of the loss.
+        """
+        room = np.maximum(freedom, 1)
+        if _robust(solution) is None:
+            return np.asarray(
+                solution.value / (4.0 * solution.stated.settings.g**2) / room
+            )  # L = sum (2 g e)^2
+        return np.asarray(self.sums[4] / room / (self.sums[5] / solution.sample.poses) ** 2)
+
+
+def _robust(solution: Solution) -> Float | None:
+    """Return the noise that a robust loss rests on, m/s^2, shape (R,); None when all poses counted alike."""
+    noise = solution.noise
+    return None if noise is None or (noise <= NO_NOISE * solution.stated.settings.g).all() else noise
+
+
+def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
+    """Go over the readings once, block by block."""
+    settings, sample, weights = solution.stated.settings, solution.sample, solution.stated.weights
+    g, noise, sensors = settings.g, _robust(solution), len(solution.sample)
+    centre = solution.stated.start.box.centre
+    nominal, bias, words = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
+    raw = modulus_errors(sample, nominal[..., None] * np.eye(3), bias, g)
+    sums: list[Float] = []
+    parts: list[list[Float]] = []
+    for (first, e, f), (_, e_raw, _) in zip(modulus_errors(sample, K, D, g), raw, strict=True):
+        real = sample.real(first, e.shape[1])
+        w = real.astype(float) if weights is None else weights[:, first : first + e.shape[1]]
+        psi: Float = np.zeros((sensors, 1))
+        slope: Float = psi
+        if noise is not None:
+            z = np.sqrt(w) * e / noise[:, None]
+            psi = loss_weight(z, settings.robust) * z * noise[:, None]
+            slope = loss_slope(z, settings.robust)
+            w = w * loss_weight(z, settings.robust)
+        scaled = np.sqrt(w) * e
+        expected = np.where(real, _expected(sample, first, f, K), 0.0)
+        squares = (real * length_error(e, g) ** 2, real * length_error(e_raw, g) ** 2, expected, scaled**2)
+        sums.append(np.stack([np.sum(part, axis=1) for part in (*squares, psi**2, slope)]))
+        number = np.broadcast_to(first + np.arange(e.shape[1]), e.shape)
+        parts.append(_worst([number.astype(float), scaled, w, f, e_raw], sample))
+    kept = _worst([np.concatenate(column, axis=1) for column in zip(*parts, strict=True)], sample)
+    return _Pass(np.sum(sums, axis=0), kept, words, nominal)
+
+
+def _worst(columns: list[Float], sample: Sample) -> list[Float]:
+    """Return the columns of the poses that are kept: all of few; of many those with the largest residuals, in order."""
+    if int(sample.poses.max()) <= KEPT:
+        return columns
+    size = np.abs(columns[1])
+    last = min(KEPT_WORST, size.shape[1]) - 1
+    index = np.sort(np.argpartition(-size, last, axis=1)[:, :KEPT_WORST], axis=1)
+    rows = np.arange(len(size))[:, None]
+    return [column[rows, index] for column in columns]
+
+
+def _expected(sample: Sample, first: int, f: Float, K: Float) -> Float:
+    """Return the variance of each pose of a block that its scatter explains, (m/s^2)^2, shape (R, B), or NaN."""
+    if sample.scatter is None or sample.count is None:
+        return np.full(f.shape[:2], np.nan)
+    part = slice(first, first + f.shape[1])
+    u = f / np.linalg.norm(f, axis=2, keepdims=True)
+    return explained(u, sample.scatter[:, part], sample.count[:, part], np.einsum("rii->ri", K))
 
 
 def length_error(e: Float, g: float) -> Float:
-    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, both of shape (B,)."""
+    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
     error: Float = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
     return error
 
 
-def examine(
-    readings: Readings,
-    model: ErrorModel,
-    before: ErrorModel,
-    g: float,
-    cofactor: Float,
-    weights: Float | None,
-    robust: Callable[[Float], Float] | None = None,
-    held: Bool | None = None,
-) -> Fit:
-    """Return the fit of a model in gauge `lower`, pose by pose.
-
-    Args:
-        readings: J poses.
-        model: the calibrated sensor, gauge `lower`; before: what the readings were taken for without it.
-        g: local gravity, m/s^2.
-        cofactor: (J^T W J)^-1, shape (9, 9).
-        weights: shape (J,) or None.
-        robust: the weight that a robust fit gave a weighted residual, m/s^2; None after least squares.
-        held: which of the nine parameters were not estimated, shape (9,).
-    """
-    after_sum, before_sum, weighted_sum = 0.0, 0.0, 0.0
-    parts: list[tuple[Int, Float, Float, Float, Float]] = []
-    uncalibrated = modulus_errors(readings, before, g)
-    for (first, e, f), (_, e_before, _) in zip(modulus_errors(readings, model, g), uncalibrated, strict=True):
-        w = np.ones(len(e)) if weights is None else weights[first : first + len(e)]
-        if robust is not None:
-            w = w * robust(np.sqrt(w) * e)
-        after_sum += square_error(e, g)
-        before_sum += square_error(e_before, g)
-        scaled = np.sqrt(w) * e
-        weighted_sum += float(np.sum(scaled * scaled))
-        kept = _worst(scaled) if readings.poses > KEPT else np.arange(len(e))
-        parts.append((first + kept, scaled[kept], w[kept], f[kept], e_before[kept]))
-    pose, scaled, w, f, before_e = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if readings.poses > KEPT:
-        kept = np.sort(_worst(scaled))
-        pose, scaled, w, f, before_e = (column[kept] for column in (pose, scaled, w, f, before_e))
-    residuals = _judge(pose, scaled, w, f, before_e, g, cofactor, weighted_sum, readings.poses, held)
-    return Fit(
-        float(np.sqrt(after_sum / readings.poses)), float(np.sqrt(before_sum / readings.poses)), residuals
-    )
-
-
-def _worst(scaled: Float) -> Int:
-    """Return the indices of the largest residuals, at most KEPT_WORST."""
-    return np.argpartition(-np.abs(scaled), min(KEPT_WORST, len(scaled)) - 1)[:KEPT_WORST]
-
-
-def _judge(
-    pose: Int,
-    scaled: Float,
-    w: Float,
-    f: Float,
-    e_before: Float,
-    g: float,
-    cofactor: Float,
-    weighted_sum: float,
-    poses: int,
-    held: Bool | None,
+def _residuals(
+    reading: _Pass, sample: Sample, cofactor: Float, freedom: Int, held: Bool | None, g: float
 ) -> PoseResiduals:
-    """Return residuals with their leverage, studentised and with the pose left out.
-
-    Studentised residuals need two degrees of freedom; `scaled` is sqrt(w) e, `weighted_sum` its squares over all poses.
-    """
-    freedom = poses - 9 + (0 if held is None else int(held.sum()))
-    size = np.linalg.norm(f, axis=1)
-    leverage = leverages(design(f / size[:, None]), w, cofactor)
+    """Return the kept residuals with their leverage, studentised and with the pose left out, and the outliers."""
+    order, scaled, w, f, e_raw = reading.columns
+    number = order.astype(np.intp)
+    real, free = number < sample.poses[:, None], freedom[:, None]
+    f = np.ascontiguousarray(f)
+    size = np.linalg.norm(f, axis=2)
+    leverage = leverages(design(f / np.where(size > 0, size, 1.0)[..., None]), w, cofactor)
     room = room_of(leverage)
-    error, studentised = size - g, studentise(scaled, room, weighted_sum, freedom)
+    error, studentised = size - g, studentise(scaled, room, reading.sums[3][:, None], free)
     left_out = error / room
-    suspect = np.flatnonzero(is_suspect(studentised, error, freedom, g))
-    if len(pose) < poses:  # of so many poses none bends the fit, unless it is beyond all measure
-        blown = suspect[np.isnan(studentised[suspect])]
-        studentised[blown] = np.copysign(np.inf, error[blown])
-    elif len(suspect):
-        alone = leave_out(
-            np.broadcast_to(f, (len(suspect), *f.shape)), np.tile(w, (len(suspect), 1)), suspect, g, held
-        )
-        studentised[suspect], left_out[suspect] = alone.studentised, alone.error
-    return PoseResiduals(pose, error, length_error(e_before, g), f, leverage, studentised, left_out)
+    sensor, pose = np.nonzero(is_suspect(studentised, error, free, g) & real)
+    if number.shape[1] < int(
+        sample.poses.max()
+    ):  # of so many poses none bends the fit, unless beyond all measure
+        blown = np.isnan(studentised[sensor, pose])
+        at = sensor[blown], pose[blown]
+        studentised[at] = np.copysign(np.inf, error[at])
+    elif len(sensor):
+        at = sensor, pose
+        studentised[at], left_out[at] = leave_out(f[sensor], w[sensor], pose, g, held)
+    beyond = beyond_chance(np.abs(studentised), sample.poses[:, None], free)
+    outlier = beyond & real & (np.abs(error) > NO_NOISE * g)
+    return PoseResiduals(
+        number, real, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
+    )
 
 
 def is_suspect(studentised: Float, error: Float, freedom: Int | int, g: float) -> Bool:
@@ -220,56 +366,26 @@ def studentise(scaled: Float, room: Float, total: Float | float, freedom: Int | 
     return found
 
 
-def outliers(residuals: PoseResiduals, poses: int, freedom: int) -> Int:
-    """Return the pose numbers whose studentised residual is beyond chance (Student t, Bonferroni)."""
-    if freedom < 2:
-        return residuals.pose[:0]
-    size = np.abs(residuals.studentised)
-    beyond = beyond_chance(size, np.full(size.shape, poses), np.full(size.shape, freedom))
-    named: Int = residuals.pose[beyond]
-    return named
-
-
 def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
-    """Return which studentised residuals are so large that none of a sensor's would be by chance, same shape.
+    """Return which studentised residuals are so large that none of a sensor's would be by chance (Student's t).
 
     Args:
-        size: absolute values, NaN for none; poses, freedom: of their sensor, same shape.
+        size: absolute values, shape (..., J), NaN for none; poses, freedom: of their sensor, broadcast to that shape.
     """
-    found: Bool = np.asarray(size > SUSPECT)
-    suspect = np.flatnonzero(found & (freedom >= 2))
-    chance = poses.flat[suspect] * student_chance(size.flat[suspect], freedom.flat[suspect] - 1)
-    found[...] = False
-    found.flat[suspect[chance < OUTLIER_LEVEL]] = True
-    return found
+    beyond: Bool = np.zeros(size.shape, dtype=bool)
+    suspect = np.nonzero((size > SUSPECT) & (freedom >= 2))
+    poses, freedom = (np.broadcast_to(a, size.shape)[suspect] for a in (poses, freedom))
+    beyond[suspect] = poses * student_chance(size[suspect], freedom - 1) < OUTLIER_LEVEL
+    return beyond
 
 
-STEPS, SETTLED = 12, 1e-6
-"""Gauss-Newton steps at most, and the part of g below which a step is the last: the next would be its square."""
+def leave_out(
+    force: Float, weights: Float, pose: Int, g: float, held: Bool | None = None
+) -> tuple[Float, Float]:
+    """Fit S sensors anew, each without one of its poses: what a pose looks like to the others.
 
-LEAST_ROOM = 1e-8
-"""The trace of a matrix times that of its inverse is below 1 over this where the other poses determine a sensor."""
-
-RIDGE = 1e-14
-"""Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
-
-
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """Poses seen by fits without them.
-
-    Attributes:
-        error: |f| - g of the pose left out, m/s^2, shape (S,).
-        studentised: the same over its standard deviation, from the residuals of the others, shape (S,).
-            Both NaN where the others do not determine the sensor, or where too few are left.
-    """
-
-    error: Float
-    studentised: Float
-
-
-def leave_out(force: Float, weights: Float, pose: Int, g: float, held: Bool | None = None) -> LeftOut:
-    """Fit S sensors anew, each without one of its poses.
+    The formula of linear regression subtracts a pose's part from the sum of squares. A pose that is wrong by several
+    per cent bends the fit so far that its part comes out larger than the whole, and the formula has nothing to say.
 
     Args:
         force: specific force by the fit with all poses, m/s^2, shape (S, J, 3).
@@ -277,6 +393,10 @@ def leave_out(force: Float, weights: Float, pose: Int, g: float, held: Bool | No
         pose: which one to leave out, shape (S,).
         g: local gravity, m/s^2.
         held: which of the nine parameters are not estimated, shape (9,).
+
+    Returns:
+        |f| - g of the pose left out over its standard deviation, from the residuals of the others, and |f| - g itself,
+        m/s^2, shape (S,) both; NaN where the others do not determine the sensor, or where too few are left.
     """
     free = np.arange(9) if held is None else np.flatnonzero(~held)
     sensors = np.arange(len(pose))
@@ -296,7 +416,7 @@ def leave_out(force: Float, weights: Float, pose: Int, g: float, held: Bool | No
         at = rows[sensors, pose]
         spread = 1.0 / weights[sensors, pose] + np.sum((cofactor @ at[..., None])[..., 0] * at, axis=1)
         error = np.linalg.norm(force[sensors, pose], axis=1) - g
-        return LeftOut(error, -e[sensors, pose] / np.sqrt(variance * spread))
+        return -e[sensors, pose] / np.sqrt(variance * spread), error
 
 
 def _linearised(force: Float, weights: Float, g: float, free: Int) -> tuple[Float, Float, Float]:
@@ -327,17 +447,19 @@ def _moved(force: Float, step: Float, g: float) -> Float:
     return moved
 
 
-def covariance(seen: Observabilities, variance: Float, walled: Bool, g: float) -> Float:
+def _covariance(observability: Observability, variance: Float, walled: Bool, g: float) -> Float:
     """Return the covariance of the nine parameters, (m/s^2)^2, shape (R, 9, 9); NaN where it does not hold.
 
     Args:
-        seen: what the poses of R sensors say.
+        observability: what the poses of R sensors say.
         variance: of one pose's modulus, (m/s^2)^2, shape (R,).
         walled: whose search stopped at a wall of its box, shape (R,): that is not the least-squares answer.
         g: local gravity, m/s^2.
     """
-    held = firm(seen.dop, seen.verdicts, np.sqrt(variance), g) & ~walled[:, None]
-    return np.where(held[:, :, None] & held[:, None], variance[:, None, None] * seen.cofactor, np.nan)
+    held = firm(observability.dop, observability.verdicts, np.sqrt(variance), g) & ~walled[:, None]
+    return np.where(
+        held[:, :, None] & held[:, None], variance[:, None, None] * observability.cofactor, np.nan
+    )
 
 
 def firm(dop: Float, verdict: Sequence[Verdict], s: Float, g: float) -> Bool:

@@ -10,7 +10,6 @@ Which poses of a log have the same attitude.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,9 +53,9 @@ def design(u: Float) -> Float:
     return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
 
 
-def verdict_of(worst: float, rank: int) -> Verdict:
+def verdict_of(worst: float, rank: int, parameters: int = 9) -> Verdict:
     """Return the verdict on poses that determine `rank` directions, with this largest dilution of precision."""
-    if rank < 9 or worst > UNDETERMINED:
+    if rank < parameters or worst > UNDETERMINED:
         return "undetermined"
     return "weak" if worst > WEAK else "good"
 
@@ -79,97 +78,89 @@ parameter along that it touches by a part in a thousand."""
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """What a set of poses says about the nine parameters.
+    """What sets of poses say about the parameters, for one set or for R of them (leading axis R).
 
     Attributes:
-        cofactor: (J^T J)^-1, its pseudo-inverse when the rank is below nine, shape (9, 9).
-        dop: dilution of precision of each parameter, shape (9,); inf where the poses do not determine it.
-        bounded: the same under the prior, at most 1000, shape (9,): it names what is not determined.
-        rank: number of determined directions, at most 9.
-    """
-
-    cofactor: Float
-    dop: Float
-    bounded: Float
-    rank: int
-
-    @classmethod
-    def of(cls, information: Float, poses: int, held: Bool | None = None) -> Observability:
-        """Return the observability of an information matrix J^T J, shape (9, 9), from `poses` poses.
-
-        `held` parameters, shape (9,), are known and not estimated.
-        """
-        return Observabilities.of(information[None], np.array([poses]), held).one(0)
-
-    @property
-    def worst(self) -> float:
-        """The largest dilution of precision."""
-        return float(self.dop.max())
-
-    @property
-    def verdict(self) -> Verdict:
-        """Definition: undetermined above 25 or below rank 9, weak above 10, good otherwise."""
-        return verdict_of(self.worst, self.rank)
-
-    def above(self, limit: float) -> list[str]:
-        """Return the names of the parameters whose bounded dilution of precision is above `limit`, worst first."""
-        order = np.argsort(-np.round(self.bounded, 3), kind="stable")
-        return [PARAMETERS[i] for i in order if self.bounded[i] > limit]
-
-
-@dataclass(frozen=True, eq=False)
-class Observabilities:
-    """What R sets of poses say about the parameters; see `Observability`.
-
-    Attributes:
-        cofactor: shape (R, 9, 9); dop, bounded: shape (R, 9); rank: shape (R,).
+        cofactor: (J^T J)^-1, its pseudo-inverse when the rank is below p, shape (..., p, p) for p parameters.
+        dop: dilution of precision of each parameter, shape (..., p); inf where the poses do not determine it.
+        bounded: the same under the prior, at most 1000, shape (..., p): it names what is not determined.
+        rank: number of determined directions, at most p, shape (...).
+        names: of the p parameters.
     """
 
     cofactor: Float
     dop: Float
     bounded: Float
     rank: Int
+    names: tuple[str, ...] = PARAMETERS
 
     @classmethod
-    def of(cls, information: Float, poses: Int, held: Bool | None = None) -> Observabilities:
-        """Return the observability of matrices J^T J, shape (R, 9, 9), from so many poses, shape (R,).
+    def of(cls, information: Float, poses: Int | int, held: Bool | None = None) -> Observability:
+        """Return the observability of matrices J^T J, shape (..., 9, 9), from so many poses, shape (...).
 
         `held` parameters, shape (9,), are known and not estimated: they have no error.
         """
         if held is not None and held.any():
             return cls._of_free(information, poses, np.flatnonzero(~held))
         values, vectors = np.linalg.eigh(information)
-        transposed = vectors.swapaxes(1, 2)
-        known = values > RANK_TOLERANCE * values[:, -1:]
+        known = values > RANK_TOLERANCE * values[..., -1:]
         inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
-        cofactor = (vectors * inverse[:, None]) @ transposed
+        cofactor = (vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2)
         # The square sum of a row of the eigenvectors, each weighted, is what stands in the diagonal.
         bounded = np.sqrt((vectors**2 @ (1.0 / (np.maximum(values, 0.0) + PRIOR))[..., None])[..., 0])
-        dop = np.sqrt(np.einsum("rpp->rp", cofactor))
-        whole = known.all(axis=1, keepdims=True)
+        dop = np.sqrt(np.einsum("...pp->...p", cofactor))
+        whole = known.all(axis=-1, keepdims=True)
         dop = np.where(whole, dop, np.where(bounded > UNDETERMINED, np.inf, bounded))
-        return cls(cofactor, dop, bounded, np.minimum(known.sum(axis=1), poses))
+        return cls(cofactor, dop, bounded, np.minimum(known.sum(axis=-1), poses))
 
     @classmethod
-    def _of_free(cls, information: Float, poses: Int, free: Int) -> Observabilities:
+    def _of_free(cls, information: Float, poses: Int | int, free: Int) -> Observability:
         """Return the observability of the parameters at `free`, the others without error."""
-        seen = cls.of(information[:, free[:, None], free], poses)
-        cofactor = np.zeros_like(information)
-        cofactor[:, free[:, None], free] = seen.cofactor
-        dop, bounded = np.zeros((2, *information.shape[:2]))
-        dop[:, free], bounded[:, free] = seen.dop, seen.bounded
-        return cls(cofactor, dop, bounded, seen.rank + 9 - len(free))
+        part = cls.of(information[..., free[:, None], free], poses)
+        cofactor, dop, bounded = np.zeros_like(information), *np.zeros((2, *information.shape[:-1]))
+        cofactor[..., free[:, None], free] = part.cofactor
+        dop[..., free], bounded[..., free] = part.dop, part.bounded
+        return cls(cofactor, dop, bounded, part.rank + 9 - len(free))
 
-    def one(self, index: int) -> Observability:
-        """Return what the set of poses number `index` says."""
+    def __getitem__(self, index: Int | int) -> Observability:
+        """Return what the sets of poses at `index` say."""
         return Observability(
-            self.cofactor[index], self.dop[index], self.bounded[index], int(self.rank[index])
+            self.cofactor[index], self.dop[index], self.bounded[index], self.rank[index], self.names
+        )
+
+    def replaced(self, where: Bool, other: Observability) -> Observability:
+        """Return the same with the sets of poses marked in shape (R,) as another has them."""
+        square, vector = where[:, None, None], where[:, None]
+        return Observability(
+            np.where(square, other.cofactor, self.cofactor),
+            np.where(vector, other.dop, self.dop),
+            np.where(vector, other.bounded, self.bounded),
+            np.where(where, other.rank, self.rank),
+            self.names,
         )
 
     @property
+    def worst(self) -> Float:
+        """The largest dilution of precision, shape (...)."""
+        return np.asarray(self.dop.max(axis=-1))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Definition: undetermined above 25 or below full rank, weak above 10, good otherwise. One set of poses."""
+        return verdict_of(float(self.worst), int(self.rank), len(self.names))
+
+    @property
     def verdicts(self) -> list[Verdict]:
-        """Return the verdict on every set of poses."""
-        return [verdict_of(*pair) for pair in zip(self.dop.max(axis=1), self.rank, strict=True)]
+        """The verdict on each of R sets of poses."""
+        return [
+            verdict_of(worst, rank, len(self.names))
+            for worst, rank in zip(self.worst.tolist(), self.rank.tolist(), strict=True)
+        ]
+
+    def above(self, limit: float) -> list[str]:
+        """Return the names of the parameters whose bounded dilution is above `limit`, worst first. One set of poses."""
+        order = np.argsort(-np.round(self.bounded, 3), kind="stable")
+        return [self.names[i] for i in order if self.bounded[i] > limit]
 
 
 def jacobian(problem: Loetters, x: Float) -> Float:
@@ -194,22 +185,6 @@ def information(problem: Loetters, x: Float) -> Float:
     J = jacobian(problem, x)
     result: Float = J.swapaxes(1, 2) @ J
     return result
-
-
-def in_words(seen: Observability, suggestions: Sequence[str]) -> tuple[str, ...]:
-    """Return the verdict in plain sentences: what is not determined, what is weak, and what would mend it."""
-    lines = []
-    lost = seen.above(UNDETERMINED)
-    if lost:
-        lines.append(f"The poses do not determine: {', '.join(lost)}.")
-    elif seen.rank < 9:
-        lines.append("The poses do not determine all nine parameters.")
-    weak = [name for name in seen.above(WEAK) if name not in lost]
-    if weak:
-        lines.append(f"Weakly determined: {', '.join(weak)}.")
-    if lines and suggestions:
-        lines.append("Poses that would mend it: " + "; ".join(suggestions) + ".")
-    return tuple(lines)
 
 
 def directions_of(output: Float, model: ErrorModel) -> Float:

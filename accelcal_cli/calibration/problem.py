@@ -298,30 +298,29 @@ def rows(x: Float) -> Float:
     return out.swapaxes(-1, -2)
 
 
-def compress(blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale: float) -> Triangle:
-    """Compress one sensor's readings.
+def compress(
+    blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale: Float, poses: Int
+) -> Triangle:
+    """Compress the readings of R sensors, block by block.
 
     Args:
-        blocks: pairs of readings, shape (B, 3) in output units, and their weights, shape (B,), or None.
-        centre: c, shape (3,); scale: s. Any values serve; near the middle and the radius of the readings they
-            keep the arithmetic free of cancellation.
+        blocks: pairs of readings, shape (R, B, 3) in output units, and their weights, shape (R, B), or None; a weight
+            of 0 leaves a reading out.
+        centre: c, shape (R, 3); scale: s, shape (R,). Any values serve; near the middle and the radius of the readings
+            they keep the arithmetic free of cancellation.
+        poses: J of each sensor, shape (R,).
     """
-    R: Float = np.zeros((11, 11))
-    poses = 0
+    R: Float = np.zeros((len(scale), 11, 11))
     for block, weight in blocks:
-        poses += len(block)
-        table = rows((block - centre) / scale)
+        table = rows((block - centre[:, None]) / scale[:, None, None])
         if weight is not None:
-            table *= np.sqrt(weight)[:, None]
-        R = _triangle(np.concatenate([R, _pieces(table)]))
-    return Triangle(R[None], np.asarray(centre)[None], np.array([scale]), np.array([poses]))
+            table *= np.sqrt(weight)[..., None]
+        R = _triangle(np.concatenate([R, _pieces(table)], axis=1))
+    return Triangle(R, centre, scale, poses)
 
 
-def compress_each(readings: Float, weights: Float | None = None, poses: Int | None = None) -> Triangle:
-    """Compress the readings of R sensors with J poses each, shape (R, J, 3), weights (R, J) or None.
-
-    Sensors with fewer poses repeat one of them with weight zero; `poses`, shape (R,), says how many there are.
-    """
+def compress_each(readings: Float, weights: Float | None = None) -> Triangle:
+    """Compress the readings of R sensors, shape (R, J, 3), with weights, shape (R, J), or None, all at once."""
     low, high = readings.min(axis=1), readings.max(axis=1)
     centre, scale = 0.5 * (low + high), 0.5 * (high - low).max(axis=1)
     table = rows((readings - centre[:, None]) / scale[:, None, None])
@@ -329,17 +328,16 @@ def compress_each(readings: Float, weights: Float | None = None, poses: Int | No
         table *= np.sqrt(weights)[..., None]
     if table.shape[1] < 11:
         table = np.concatenate([table, np.zeros((len(table), 11 - table.shape[1], 11))], axis=1)
-    each = np.full(len(readings), readings.shape[1]) if poses is None else poses
-    return Triangle(_triangle(table), centre, scale, each)
+    return Triangle(_triangle(table), centre, scale, np.full(len(readings), readings.shape[1]))
 
 
 def _pieces(table: Float) -> Float:
-    """Return rows with the same R as `table`, fewer by a factor PIECE / 11 when there are many."""
-    whole = len(table) // PIECE * PIECE
+    """Return rows with the same R as `table`, shape (R, J, 11), fewer by a factor PIECE / 11 where there are many."""
+    whole = table.shape[1] // PIECE * PIECE
     if whole <= PIECE:
         return table
-    small = _triangle(table[:whole].reshape(-1, PIECE, 11)).reshape(-1, 11)
-    return np.concatenate([_pieces(small), table[whole:]])
+    small = _triangle(table[:, :whole].reshape(-1, PIECE, 11)).reshape(len(table), -1, 11)
+    return np.concatenate([_pieces(small), table[:, whole:]], axis=1)
 
 
 def _triangle(table: Float) -> Float:

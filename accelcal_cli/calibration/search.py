@@ -1,4 +1,11 @@
-"""Search with the chosen optimizer, polish by Levenberg-Marquardt, and the robust rounds after it."""
+"""From readings to a solution: the problem is stated, searched with the chosen optimizer, polished, and reweighted.
+
+Weights `auto`: poses share an error of their own beside the noise of their readings. The variance of a pose is
+m^2 + v_j: v_j from the scatter of its readings and their number, m^2 what the fit leaves beyond that (a table that
+gives, a sensor that is not linear), the same for all poses. Weights 1 / (m^2 + v_j) follow the number of readings while
+noise rules, and level off where it does not. m^2 is the value for which the weighted squares have their expectation
+J - 9 [paule1982].
+"""
 
 from __future__ import annotations
 
@@ -7,18 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
-from accelcal_cli.calibration import weights as robust
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.box import Start, search_box
-from accelcal_cli.calibration.fit import NO_NOISE, modulus_errors
-from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress
+from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress, least_squares
+from accelcal_cli.calibration.result import Temperature
+from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import explained
-from accelcal_cli.errors import DataError
-from accelcal_cli.io.readings import Readings
+from accelcal_cli.calibration.weights import NORMAL_MAD, explained, loss_weight, pose_weights
 from accelcal_cli.optimization.minimize import Run, minimize
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.sensor.model import ErrorModel, to_gauge
+from accelcal_cli.sensor.model import to_gauge
 
 SAME_MINIMUM = 1e-6
 """Two searches ended in the same minimum when their polished costs differ by at most this part."""
@@ -26,189 +31,299 @@ SAME_MINIMUM = 1e-6
 ROUNDING = 1e-26
 """A cost per reading, in units of g^4, below which only rounding is left."""
 
-REWEIGHTINGS = 50
-"""Robust rounds at most; they converge in about ten."""
+NO_NOISE = 1e-9
+"""Residuals, or their standard deviation, below this part of g are rounding: readings are seldom written with ten
+digits, and no accelerometer is as quiet."""
+
+REWEIGHTINGS, SETTLED = 50, 1e-9
+"""Robust rounds at most, about ten are the rule; and the step, in half-widths of the box, that ends them."""
+
+SCALE_SAMPLE = 100_000
+"""At most about this many residuals decide the scale of a robust loss."""
+
+SHARED_ROUNDS, SHARED_SETTLED = 10, 0.01
+"""Rounds of weights and fit at most, three or four are the rule; and the relative change of m^2 that ends them."""
+
+LEAST_SHARED = 0.01
+"""Least m^2, as part of the mean v_j: no pose is free of every other error."""
+
+SLOPES = 6
+"""Parameters more where scale factors and biases are linear in temperature."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """The problem of R sensors as it is stated.
+
+    Attributes:
+        sample: their readings; settings: of the calibration.
+        weights: of the poses, shape (R, J), or None.
+        cost: the Loetters cost in its box; start: where the box comes from.
+    """
+
+    sample: Sample
+    settings: Settings
+    weights: Float | None
+    cost: Loetters
+    start: Start
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search found, and at what expense.
+
+    Attributes:
+        optimizer: its name; runs: searches per sensor.
+        cost: L of the best run after the search, shape (R,), (m/s^2)^4.
+        evaluations: of the cost, search and polish together, shape (R,).
+        agreeing: how many runs ended in the best one's minimum, shape (R,).
+        run: all runs, and `best`, the row of each sensor's best one, shape (R,); None where there was no search.
+    """
+
+    optimizer: str
+    runs: int
+    cost: Float
+    evaluations: Int
+    agreeing: Int
+    run: Run | None = None
+    best: Int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """A fit of fifteen parameters; see calibration.temperature.
+
+    Attributes:
+        temperature: the slopes.
+        sample: the readings at the reference temperature.
+        loss: information that the slopes take from the nine, shape (R, 9, 9).
+    """
+
+    temperature: Temperature
+    sample: Sample
+    loss: Float
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What search and polish found.
+    """What search, polish and robust rounds found.
 
     Attributes:
-        problem: the problem as last solved (with the robust weights, if any).
-        x: the best run's point, shape (1, D).
-        search: the search, all runs.
-        best: number of the best run's row in `search`.
-        cost: L at x; evaluations: all of them.
-        agreeing: how many runs ended in the same minimum.
-        noise: robust standard deviation of e, m/s^2; None without a robust loss.
-        reweighted_from: with a robust loss the problem before it, with the weights of the poses alone.
+        stated: the problem; search: how it was searched.
+        cost: the Loetters cost as last solved, with the weights of a robust loss; plain: without them.
+        x: the best point of each sensor, shape (R, D); value: L there, shape (R,), (m/s^2)^4.
+        noise: robust standard deviation of e, m/s^2, shape (R,); None without a robust loss.
+        slopes: with temperature, where the readings determine them.
+        notes: what a user should know of it, in sentences.
     """
 
-    problem: Loetters
+    stated: Stated
+    search: Search
+    cost: Loetters
+    plain: Loetters
     x: Float
-    search: Run
-    best: int
-    cost: float
-    evaluations: int
-    agreeing: int
-    noise: float | None = None
-    reweighted_from: Loetters | None = None
+    value: Float
+    noise: Float | None = None
+    slopes: Slopes | None = None
+    notes: tuple[str, ...] = ()
 
     @property
-    def stated(self) -> Loetters:
-        """The problem as it was stated, without robust weights: what the poses alone say."""
-        return self.problem if self.reweighted_from is None else self.reweighted_from
+    def sample(self) -> Sample:
+        """The readings that were fitted: with slopes, those at the reference temperature."""
+        return self.stated.sample if self.slopes is None else self.slopes.sample
+
+    def solved_anew(self, cost: Loetters) -> Solution:
+        """Return the solution carried over to a cost that differs a little: polished from where it was."""
+        polished = polish(cost, self.x)
+        search = replace(self.search, evaluations=self.search.evaluations + polished.evaluations)
+        return replace(self, cost=cost, x=polished.x, value=polished.cost, search=search)
 
 
-def search(problem: Loetters, settings: Settings) -> Solution:
-    """Search with the chosen optimizer, then polish every run's best point by Levenberg-Marquardt."""
-    optimizer = settings.build_optimizer()
-    found = minimize(problem, optimizer, runs=settings.runs, seed=settings.seed)
-    x, cost = found.x, found.cost
-    evaluations = int(found.evaluations.sum())
-    if not np.isfinite(cost).any():
-        # The search failed altogether (a closed form without a solution): the box centre is still a start.
-        x = np.zeros_like(x)
-        cost = problem.cost(x[:, None])[:, 0]
+def state(sample: Sample, settings: Settings) -> Stated:
+    """State the problem of readings that give the weights asked for."""
+    if settings.weights == "auto":
+        return _shared(sample, settings)
+    return _stated(sample, settings, pose_weights(sample, settings.weights))
+
+
+def _stated(sample: Sample, settings: Settings, weights: Float | None) -> Stated:
+    triangle = packed(sample, weights)
+    start = search_box(triangle, settings)
+    return Stated(sample, settings, weights, Loetters(triangle, settings.g, start.box), start)
+
+
+def packed(sample: Sample, weights: Float | None, within: Sample | None = None) -> Triangle:
+    """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
+    extent = within or sample
+    centre = 0.5 * (extent.lower + extent.upper)
+    scale = 0.5 * (extent.upper - extent.lower).max(axis=1)
+    blocks = (
+        (block, None if weights is None else weights[:, first : first + block.shape[1]])
+        for first, block in sample.blocks()
+    )
+    return compress(blocks, centre, scale, sample.poses)
+
+
+def modulus_errors(sample: Sample, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
+    """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).
+
+    K, shape (R, 3, 3), and D, shape (R, 3), are those of the sensors.
+    """
+    K_A = np.linalg.inv(K)
+    for first, block in sample.blocks():
+        # Columns of contiguous memory: ten times as fast as rows of three for many poses.
+        f = K_A @ np.subtract(block.swapaxes(1, 2), D[..., None], order="C")
+        yield first, (g * g - np.einsum("rij,rij->rj", f, f)) / (2.0 * g), f.swapaxes(1, 2)
+
+
+def search(stated: Stated, *, closed: bool = False) -> Solution:
+    """Search with the chosen optimizer, then polish every run's best point by Levenberg-Marquardt.
+
+    With `closed` the search is left out where the readings give the point of least cost in closed form, as a fleet
+    wants it: one start per sensor, and the polish confirms it with a step.
+    """
+    settings, cost, sensors = stated.settings, stated.cost, len(stated.sample)
+    runs = settings.runs
+    run = _closed(stated) if closed else _searched(cost, settings, sensors)
+    x, value = run.x, run.cost
+    evaluations = run.evaluations
+    if not np.isfinite(value).all():
+        # A search that failed altogether (a closed form without a solution): the box centre is still a start.
+        failed = ~np.isfinite(value.reshape(sensors, runs)).any(axis=1).repeat(runs)
+        x = np.where(failed[:, None], 0.0, x)
+        value = np.where(failed, _tiled(cost, sensors, runs).cost(x[:, None])[:, 0], value)
     if settings.polish:
-        x = np.where(np.isfinite(x), x, 0.0)
-        polished = polish(problem, x)
-        evaluations += int(polished.evaluations.sum())
-        x, cost = polished.x, polished.cost
-    best = int(np.nanargmin(cost))
-    agreeing = int((cost <= cost[best] * (1.0 + SAME_MINIMUM) + rounding(problem)).sum())
-    return Solution(problem, x[best : best + 1], found, best, float(cost[best]), evaluations, agreeing)
+        polished = polish(_tiled(cost, sensors, runs), np.where(np.isfinite(x), x, 0.0))
+        evaluations = evaluations + polished.evaluations
+        x, value = polished.x, polished.cost
+    value = value.reshape(sensors, runs)
+    best = np.nanargmin(value, axis=1)
+    least = value[np.arange(sensors), best]
+    agreeing = (value <= least[:, None] * (1.0 + SAME_MINIMUM) + rounding(cost)[:, None]).sum(axis=1)
+    row = np.arange(sensors) * runs + best
+    spent = evaluations.reshape(sensors, runs).sum(axis=1)
+    found = Search(settings.optimizer, runs, run.cost[row], spent, agreeing, run, row)
+    return Solution(stated, found, cost, cost, x[row], least)
 
 
-def rounding(problem: Loetters) -> float:
-    """Return the cost, (m/s^2)^4, below which only rounding is left."""
-    return float(ROUNDING * problem.triangle.poses.max() * problem.g**4)
+def _searched(cost: Loetters, settings: Settings, sensors: int) -> Run:
+    """Return the runs of every sensor, those of the first one first; each sensor has runs 0, 1, ... of its own."""
+    numbers = list(range(settings.runs)) * sensors
+    problem = _tiled(cost, sensors, settings.runs)
+    return minimize(problem, settings.build_optimizer(), runs=numbers, seed=settings.seed)
 
 
-def to_gain(solution: Solution) -> float:
-    """Return the part of the cost that a Gauss-Newton step is expected to take off, 0 where only rounding is left."""
-    problem, x = solution.problem, solution.x[:, None]
-    if solution.cost <= rounding(problem):
-        return 0.0
-    residual, slope = problem.residuals(x)[0, 0], problem.jacobian(x)[0, 0]
-    step = np.linalg.lstsq(slope, residual)[0]
-    return float(np.sum((slope @ step) ** 2) / np.sum(residual**2))
+def _tiled(cost: Loetters, sensors: int, runs: int) -> Loetters:
+    """Return the cost of so many runs of every sensor; runs of a single one share it."""
+    return cost if sensors == 1 or runs == 1 else cost.of(np.repeat(np.arange(sensors), runs))
 
 
-def polish(problem: Loetters, x: Float) -> Run:
+def _closed(stated: Stated) -> Run:
+    """Return one run per sensor at the least cost where the readings give it, else from a search."""
+    cost, settings = stated.cost, stated.settings
+    triangle = cost.triangle
+    K, d = least_squares(triangle)
+    K = K * triangle.scale[:, None, None] / cost.g
+    x = cost.coordinates(K, d * triangle.scale[:, None] + triangle.centre)
+    inside = np.isfinite(x).all(axis=1) & (np.abs(np.nan_to_num(x)) < 1.0).all(axis=1)
+    lacking = np.flatnonzero(~inside | np.array([source == "sphere" for source in stated.start.sources]))
+    evaluations = np.zeros(len(x), dtype=np.int64)
+    if len(lacking):
+        # Each of them would be run 0 of a calibration of its own.
+        zeros = [0] * len(lacking)
+        part = minimize(
+            cost.of(lacking), settings.build_optimizer(), runs=zeros, seed=settings.seed, trace=False
+        )
+        x[lacking], evaluations[lacking] = part.x, part.evaluations
+    value = cost.cost(x[:, None])[:, 0]
+    return Run(np.zeros(len(x), dtype=np.int64), x, value, evaluations, 0 * evaluations, ())
+
+
+def rounding(cost: Loetters) -> Float:
+    """Return the cost, (m/s^2)^4, below which only rounding is left, shape (R,)."""
+    return np.asarray(ROUNDING * cost.triangle.poses * cost.g**4)
+
+
+def polish(cost: Loetters, x: Float) -> Run:
     """Return Levenberg-Marquardt runs from x, shape (R, D), inside the box."""
     solver = OPTIMIZERS.get("levenberg-marquardt")()
-    return minimize(problem, solver, runs=len(x), start=x[:, None, :], trace=False)
+    return minimize(cost, solver, runs=len(x), start=x[:, None, :], trace=False)
 
 
-def resolve(solution: Solution, problem: Loetters) -> Solution:
-    """Return a solution carried over to a problem that differs a little: polished from where it was."""
-    polished = polish(problem, solution.x)
-    evaluations = solution.evaluations + int(polished.evaluations.sum())
-    return replace(
-        solution, problem=problem, x=polished.x, cost=float(polished.cost[0]), evaluations=evaluations
-    )
+def in_lower(cost: Loetters, K: Float, D: Float) -> tuple[Loetters, Float]:
+    """Return the nine-parameter problem of the same readings, and its point, shape (R, 9), for sensors K and D.
+
+    Uncertainty is always computed in gauge `lower`, whatever is searched or printed.
+    """
+    half = cost.box.half
+    # Any width: derivatives alone are asked for.
+    turned = half[:, 3:6] if cost.unknowns > 6 else half[:, :3]
+    half = np.concatenate([half[:, :3], turned, half[:, -3:]], axis=1)
+    nine = Loetters(cost.triangle, cost.g, Box(np.zeros((len(K), 9)), half))
+    return nine, nine.coordinates(to_gauge(K, "lower"), D)
 
 
-def reweight(solution: Solution, readings: Readings, settings: Settings, weights: Float | None) -> Solution:
-    """Solve again under the robust loss: weights from the residuals, residuals from the weights."""
-    g, triangle = settings.g, solution.problem.triangle
-    solution = replace(solution, reweighted_from=solution.problem)
+def reweight(solution: Solution) -> Solution:
+    """Solve again under the robust loss, if there is one: weights from the residuals, residuals from the weights."""
+    settings, sample = solution.stated.settings, solution.stated.sample
+    if settings.robust == "none":
+        return solution
     for _ in range(REWEIGHTINGS):
-        model = model_at(solution.problem, solution.x)
-        noise = robust.noise_scale(readings, model, g)
-        if noise <= NO_NOISE * g:  # noise-free readings: every weight is 1
+        K, D = solution.cost.parameters(solution.x)
+        noise = _noise_scale(sample, K, D, settings.g)
+        if (noise <= NO_NOISE * settings.g).all():  # noise-free readings: every weight is 1
             return replace(solution, noise=noise)
-        blocks = robust.robust_blocks(readings, model, g, noise, settings.robust, weights)
-        problem = Loetters(compress(blocks, triangle.centre[0], triangle.scale[0]), g, solution.problem.box)
-        polished = polish(problem, solution.x)
-        moved = float(np.abs(polished.x - solution.x).max())
-        evaluations = solution.evaluations + int(polished.evaluations.sum())
-        solution = replace(
-            solution,
-            problem=problem,
-            x=polished.x,
-            cost=float(polished.cost[0]),
-            evaluations=evaluations,
-            noise=noise,
-        )
-        if moved < 1e-9:
+        triangle = solution.cost.triangle
+        blocks = _robust_blocks(solution, K, D, noise)
+        triangle = compress(blocks, triangle.centre, triangle.scale, triangle.poses)
+        before, cost = solution.x, Loetters(triangle, settings.g, solution.cost.box)
+        solution = replace(solution.solved_anew(cost), noise=noise)
+        if np.abs(solution.x - before).max() < SETTLED:
             break
     return solution
 
 
-def model_at(problem: Loetters, x: Float) -> ErrorModel:
-    """Return the sensor at x, shape (1, D), as the search's gauge has it (`lower` or `full`)."""
-    K, D = problem.parameters(x)
-    return ErrorModel(K[0], D[0])
+def _noise_scale(sample: Sample, K: Float, D: Float, g: float) -> Float:
+    """Return a robust standard deviation of e, m/s^2, shape (R,): its median absolute value times 1.4826."""
+    poses = int(sample.poses.max())
+    stride = max(1, poses // SCALE_SAMPLE)
+    sizes = [np.abs(e)[:, (-first) % stride :: stride] for first, e, _ in modulus_errors(sample, K, D, g)]
+    # Nine parameters follow the smallest residuals: the factor gives the scale back what they took.
+    freedom = max(1.0, poses - 9.0) / poses
+    return np.asarray(NORMAL_MAD * np.median(np.concatenate(sizes, axis=1), axis=1) / np.sqrt(freedom))
 
 
-def lower_problem(problem: Loetters, model: ErrorModel) -> tuple[Loetters, Float]:
-    """Return the nine-parameter problem and its point, shape (1, 9), of the same readings and sensor.
-
-    Uncertainty is always computed in gauge `lower`, whatever is searched or printed.
-    """
-    K = to_gauge(model.K, "lower")
-    half = problem.box.half
-    turned = (
-        half[:, 3:6] if problem.unknowns > 6 else half[:, :3]
-    )  # any width: derivatives alone are asked for
-    half = np.concatenate([half[:, :3], turned, half[:, -3:]], axis=1)
-    nine = Loetters(problem.triangle, problem.g, Box(np.zeros((1, 9)), half))
-    return nine, nine.coordinates(K[None], model.D[None])
+def _robust_blocks(
+    solution: Solution, K: Float, D: Float, noise: Float
+) -> Iterator[tuple[Float, Float | None]]:
+    """Yield readings with their robust weights, block by block."""
+    settings, sample, weights = solution.stated.settings, solution.stated.sample, solution.stated.weights
+    errors = modulus_errors(sample, K, D, settings.g)
+    for (first, block), (_, e, _) in zip(sample.blocks(), errors, strict=True):
+        own: Float | float = 1.0 if weights is None else weights[:, first : first + e.shape[1]]
+        yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
 
 
-ROUNDS = 10
-"""Rounds of weights and fit at most; three or four are the rule."""
-
-
-SETTLED = 0.01
-"""Relative change of m^2 that ends the rounds."""
-
-
-LEAST = 0.01
-"""Least m^2, as part of the mean v_j: no pose is free of every other error."""
-
-
-def packed(readings: Readings, weights: Float | None, within: Readings | None = None) -> Triangle:
-    """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
-    extent = within or readings
-    centre = 0.5 * (extent.lower + extent.upper)
-    scale = 0.5 * float((extent.upper - extent.lower).max())
-    return compress(_weighted(readings, weights), centre, scale)
-
-
-def _weighted(readings: Readings, weights: Float | None) -> Iterator[tuple[Float, Float | None]]:
-    """Yield readings with their weights, block by block."""
-    for first, block in readings.blocks():
-        yield block, None if weights is None else weights[first : first + len(block)]
-
-
-def shared_weights(readings: Readings, settings: Settings) -> Float | None:
-    """Return the weights, mean 1, shape (J,); None when nine poses or fewer leave nothing to tell them by.
-
-    Raises:
-        DataError: the readings carry no count or no scatter.
-    """
-    if readings.count is None or readings.scatter is None or np.isnan(readings.scatter).any():
-        raise DataError(
-            f"{readings.source}: --weights auto needs the number of readings and their standard deviation (columns "
-            "n, sx, sy, sz), or at least two readings of every pose"
-        )
-    if readings.poses <= 9:
-        return None
-    weights, before = None, -1.0
-    for _ in range(ROUNDS):
-        problem, x = fitted(readings, settings, weights)
-        errors, own = _errors(readings, model_at(problem, x), settings.g)
-        shared = shared_variance(errors, own, readings.poses - 9)
-        shared = max(shared, LEAST * float(own.mean()))
-        if not shared > 0 or abs(shared - before) <= SETTLED * shared:
+def _shared(sample: Sample, settings: Settings) -> Stated:
+    """State the problem with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
+    stated = _stated(sample, settings, None)
+    if sample.poses.max() <= 9 or sample.count is None or sample.scatter is None:
+        return stated
+    before = -1.0
+    for _ in range(SHARED_ROUNDS):
+        x = polish(stated.cost, np.zeros_like(stated.cost.box.centre)).x
+        K, D = stated.cost.parameters(x)
+        parts = list(modulus_errors(sample, K, D, settings.g))
+        errors, force = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
+        u = force / np.linalg.norm(force, axis=2, keepdims=True)
+        own = explained(u, sample.scatter, sample.count, np.einsum("rii->ri", K))
+        shared = shared_variance(errors[0], own[0], int(sample.poses[0]) - 9)
+        shared = max(shared, LEAST_SHARED * float(own.mean()))
+        if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
-        weights, before = 1.0 / (shared + own), shared
-        weights = weights / weights.mean()
-    return weights
+        before, weights = shared, 1.0 / (shared + own)
+        stated = _stated(sample, settings, weights / weights.mean())
+    return stated
 
 
 def shared_variance(errors: Float, own: Float, freedom: int) -> float:
@@ -231,26 +346,3 @@ def shared_variance(errors: Float, own: Float, freedom: int) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return high
-
-
-def opened(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Start]:
-    """Return the problem of the weighted readings, and where its box comes from."""
-    triangle = packed(readings, weights)
-    start = search_box(triangle, settings)
-    return Loetters(triangle, settings.g, start.box), start
-
-
-def fitted(readings: Readings, settings: Settings, weights: Float | None) -> tuple[Loetters, Float]:
-    """Return the problem of the weighted readings and the point, shape (1, D), polished from the middle of its box."""
-    problem, _ = opened(readings, settings, weights)
-    return problem, polish(problem, np.zeros_like(problem.box.centre)).x
-
-
-def _errors(readings: Readings, model: ErrorModel, g: float) -> tuple[Float, Float]:
-    """Return the error of each pose's modulus, m/s^2, and the variance that its readings lend it, both (J,)."""
-    errors = np.concatenate([e for _, e, _ in modulus_errors(readings, model, g)])
-    force = model.specific_force(readings.output())
-    u = force / np.linalg.norm(force, axis=1, keepdims=True)
-    if readings.scatter is None or readings.count is None:
-        return errors, np.zeros_like(errors)
-    return errors, explained(u, readings.scatter, readings.count, np.diagonal(model.K))

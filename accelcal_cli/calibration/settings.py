@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from accelcal_cli.config import load_mapping, shipped_parameters
+from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, shipped_parameters
 from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
@@ -29,6 +29,9 @@ ALIGNED = {
     "attitudes": ("unknown",),
 }
 """What goes with axes that are taken as perpendicular."""
+
+KNOWN = {"robust": ("none",), "weights": ("none", "n", "sd")}
+"""What goes with known attitudes."""
 
 
 @dataclass(frozen=True)
@@ -89,15 +92,17 @@ class Settings:
     def __post_init__(self) -> None:
         """Refuse a setting outside its range, and what does not go with perpendicular axes."""
         check(self)
-        if self.misalignment:
-            return
-        for key, allowed in ALIGNED.items():
-            if getattr(self, key) not in allowed:
-                raise ConfigError(
-                    f"{key}: {getattr(self, key)} does not go with misalignment: false; expected {' or '.join(allowed)}"
-                )
+        for applies, words, limits in (
+            (not self.misalignment, "misalignment: false", ALIGNED),
+            (self.attitudes == "known", "--attitudes known", KNOWN),
+        ):
+            for key, allowed in limits.items() if applies else ():
+                if getattr(self, key) not in allowed:
+                    raise ConfigError(
+                        f"{key}: {getattr(self, key)} does not go with {words}; expected {' or '.join(allowed)}"
+                    )
 
-    def build_optimizer(self) -> Optimizer:
+    def build_optimizer(self) -> Optimizer[State]:
         """Return the optimizer with its parameters.
 
         Raises:

@@ -8,59 +8,55 @@ brought to T_0 are then those of a plain sensor, and everything else is done wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, WEAK
-from accelcal_cli.calibration.problem import ROWS_COLUMNS
+from accelcal_cli.calibration.problem import ROWS_COLUMNS, Loetters
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.io.readings import Readings
-from accelcal_cli.io.stream import RowStore
-from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.calibration.search import SLOPES, Slopes, Solution, packed
+from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
 SMALLEST_RANGE = 5.0
 """Degrees between the coldest and the warmest pose below which slopes would be extrapolated at once."""
 
-SLOPES = 6
 MOST_POSES = 100_000
 STEPS, SETTLED = 30, 1e-12
 """Gauss-Newton steps at most, and the step, as part of g, that ends them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Slopes:
-    """A fit of fifteen parameters.
+def with_slopes(solution: Solution) -> Solution:
+    """Return the solution with slopes, where there is a temperature column that determines them, and a note of it.
 
-    Attributes:
-        temperature: the slopes.
-        readings: the readings at the reference temperature.
-        loss: information that the slopes take from the nine, shape (9, 9).
+    One sensor; the parameters of a solution with slopes hold at the mean temperature.
     """
+    sample, settings = solution.stated.sample, solution.stated.settings
+    if sample.temperature is None or not settings.temperature:
+        return solution
+    degrees = sample.temperature[0]
+    why = _unsuitable(solution, degrees)
+    slopes = None if why else _fit(solution, degrees)
+    if slopes is None:
+        why = why or "the poses do not determine slopes with temperature"
+        return replace(solution, notes=(*solution.notes, f"Temperature column not used: {why}."))
+    triangle = packed(slopes.sample, solution.stated.weights, within=sample)
+    cost = Loetters(triangle, settings.g, solution.cost.box)
+    middle = slopes.temperature.reference
+    note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
+    return replace(solution.solved_anew(cost), plain=cost, slopes=slopes, notes=(*solution.notes, note))
 
-    temperature: Temperature
-    readings: Readings
-    loss: Float
 
-
-def fit(readings: Readings, model: ErrorModel, g: float, weights: Float | None) -> tuple[Slopes | None, str]:
-    """Return the slopes with temperature, or None, and a sentence that says what was done.
-
-    Args:
-        readings: J poses, with temperatures.
-        model: the plain solution.
-        g: local gravity, m/s^2.
-        weights: of the poses, shape (J,), or None.
-    """
-    why = _unsuitable(readings)
-    degrees = readings.temperature
-    if why or degrees is None:
-        return None, f"Temperature column not used: {why}."
-    low, middle = model.in_gauge("lower"), float(degrees.mean())
-    half = 0.5 * float(np.ptp(degrees))
-    N, t = readings.output(), (degrees - middle) / half
-    root = np.ones(len(N)) if weights is None else np.sqrt(weights)
+def _fit(solution: Solution, degrees: Float) -> Slopes | None:
+    """Return the slopes of poses of these temperatures, shape (J,), or None where they do not determine them."""
+    sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.stated.weights
+    K, D = solution.cost.parameters(solution.x)
+    low = ErrorModel(to_gauge(K[0], "lower"), D[0])
+    N = sample.output()[0]
+    middle, half = float(degrees.mean()), 0.5 * float(np.ptp(degrees))
+    t = (degrees - middle) / half
+    root = np.ones(len(N)) if weights is None else np.sqrt(weights[0])
     p: Float = np.zeros(9 + SLOPES)
     dop: Float = np.zeros(SLOPES)
     for _ in range(STEPS):
@@ -68,42 +64,37 @@ def fit(readings: Readings, model: ErrorModel, g: float, weights: Float | None) 
         information = (J * root[:, None]).T @ (J * root[:, None])
         dop = _slope_dop(information)
         if not dop.max() <= WEAK:
-            return None, "Temperature column not used: the poses do not determine slopes with temperature."
+            return None
         step = np.linalg.solve(information, -(J * root[:, None]).T @ (root * e))
         p = p + step
         if np.abs(step).max() <= SETTLED * g:
             break
-    s = float(np.sqrt((root * e) @ (root * e) / (readings.poses - 9 - SLOPES)))
+    s = float(np.sqrt((root * e) @ (root * e) / (len(N) - 9 - SLOPES)))
     units = np.repeat([1.0 / g, 1.0], 3) * np.concatenate([np.ones(3), np.diagonal(low.K)]) / half
     (scale, bias), (sigma_scale, sigma_bias) = np.split(p[9:] * units, 2), np.split(s * dop * units, 2)
-    span = float(degrees.min()), float(degrees.max())
-    found = Temperature(middle, *span, scale, bias, sigma_scale, sigma_bias, dop)
+    temperature = Temperature(
+        middle, float(degrees.min()), float(degrees.max()), scale, bias, sigma_scale, sigma_bias, dop
+    )
     B, C = information[:9, 9:], information[9:, 9:]
-    brought = found.at_reference(N, degrees, _moved(low, p, g).D)
-    note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
-    return Slopes(found, at(readings, brought), B @ np.linalg.solve(C, B.T)), note
+    brought = temperature.at_reference(N, degrees, _moved(low, p, g).D)
+    return Slopes(temperature, sample.with_output(brought[None]), (B @ np.linalg.solve(C, B.T))[None])
 
 
-def at(readings: Readings, output: Float) -> Readings:
-    """Return readings with other outputs, shape (J, 3)."""
-    store = RowStore()
-    store.append(np.asarray(output, dtype=np.float64))
-    return replace(readings, lower=output.min(axis=0), upper=output.max(axis=0), _store=store)
-
-
-def _unsuitable(readings: Readings) -> str:
-    """Return why the temperatures cannot be used, or nothing."""
-    degrees = readings.temperature
-    if degrees is None:
-        return "there is none"
-    if readings.poses > MOST_POSES:
+def _unsuitable(solution: Solution, degrees: Float) -> str:
+    """Return why temperatures, shape (J,), cannot be used, or nothing."""
+    settings, poses = solution.stated.settings, len(degrees)
+    if settings.robust != "none":
+        return "slopes with temperature go with plain least squares only"
+    if not settings.misalignment:
+        return "slopes with temperature are fitted beside misalignments only"
+    if poses > MOST_POSES:
         return f"more than {MOST_POSES:,} poses"
     if not np.isfinite(degrees).all():
         return f"it is missing in {int((~np.isfinite(degrees)).sum())} poses"
     if np.ptp(degrees) < SMALLEST_RANGE:
         return f"the poses differ by {np.ptp(degrees):.2g} degrees, and {SMALLEST_RANGE:g} are needed"
-    if readings.poses < 17:
-        return f"{readings.poses} poses are too few for fifteen parameters; take at least 17"
+    if poses < 17:
+        return f"{poses} poses are too few for fifteen parameters; take at least 17"
     return ""
 
 

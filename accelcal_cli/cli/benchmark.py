@@ -72,8 +72,8 @@ def command(
     evaluations, and ranks with a significance test when several optimizers run on several functions.
     """
     from accelcal_cli.studies.benchmark import Benchmark
-    from accelcal_cli.studies.entries import ALL, Budget, choose, words
     from accelcal_cli.studies.functions import select
+    from accelcal_cli.studies.study import ALL, Budget, choose, words
 
     options.check_format(format)
     options.check_apart([config], {"--raw": raw, "--plot": plot})
@@ -102,26 +102,28 @@ def command(
 
 def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.benchmark import curves, summary
+    from accelcal_cli.studies.benchmark import rank
+    from accelcal_cli.studies.study import median_curves
+    from accelcal_cli.views.studies import benchmark_blocks, benchmark_table, benchmark_title, ranking_table
 
-    rows = summary(study, records)
+    rows = benchmark_table(study, records)
     if format == "json":
         sys.stdout.write(json_text(json_rows([rows])))
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
         from accelcal_cli.output.console import show
-        from accelcal_cli.studies import benchmark as ranks
-        from accelcal_cli.views.blocks import benchmark
 
-        ranking = ranks.rank(study, records)
-        further = [ranks.table(ranking)] if ranking else []
-        show(benchmark(study.title, rows, curves(study, records), study.tolerance, further))
+        ranking = rank(study, records)
+        further = [ranking_table(ranking)] if ranking else []
+        curves = median_curves(study, records)
+        show(benchmark_blocks(benchmark_title(study), rows, curves, study.tolerance, further))
     sys.stdout.flush()
 
 
 def _plot(study: Benchmark, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.benchmark import curves
+    from accelcal_cli.studies.study import median_curves
+    from accelcal_cli.views.studies import benchmark_title
 
-    plot_convergence(study.title, curves(study, records), study.tolerance, path)
+    plot_convergence(benchmark_title(study), median_curves(study, records), study.tolerance, path)

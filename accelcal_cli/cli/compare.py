@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -102,8 +102,8 @@ def command(
     """
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.studies.compare import Comparison
-    from accelcal_cli.studies.entries import Budget, choose, words
-    from accelcal_cli.studies.scenarios import Search
+    from accelcal_cli.studies.scenarios import SearchSpace
+    from accelcal_cli.studies.study import Budget, choose, words
 
     options.check_format(format)
     type_file = sensor if sensor is not None and Path(sensor).suffix else None
@@ -111,7 +111,7 @@ def command(
     running.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
-    space = Search(options.gravity(g, None, None) or STANDARD_GRAVITY, _unknowns(gauge))
+    space = SearchSpace(options.gravity(g, None, None) or STANDARD_GRAVITY, _unknowns(gauge))
     entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
     if data is None:
         source: Simulation | Recording = _simulated(sensor, positions, scheme, noise, fixed, columns)
@@ -184,26 +184,30 @@ def _recorded(data: str, columns: str | None, g: float, simulation: Sequence[str
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.compare import curves, summary
+    from accelcal_cli.studies.study import median_curves
+    from accelcal_cli.views.experiments import comparison_conditions, comparison_subject, comparison_table
 
-    rows = summary(study, records)
+    rows = comparison_table(study, records)
     if format == "json":
         sys.stdout.write(json_text(json_rows([rows])))
     elif format == "csv":
         write_csv(rows, sys.stdout)
     else:
         from accelcal_cli.output.console import show
-        from accelcal_cli.views import blocks
+        from accelcal_cli.views.studies import study_blocks
 
-        plotted: dict[str, Any] = {"Convergence": found} if (found := curves(study, records)) else {}
-        tables = [replace(rows.filled(), title="")]
-        show(blocks.study(study.subject, tables, plotted, study.conditions))
+        panels = median_curves(study, records)
+        plotted = {"Convergence": panels[""]} if panels[""] else {}
+        title, note = comparison_subject(study), comparison_conditions(study)
+        show(study_blocks(title, [replace(rows.filled(), title="")], plotted, note))
     sys.stdout.flush()
 
 
 def _plot(study: Comparison, records: Sequence[Record], path: str) -> None:
     from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.compare import curves
+    from accelcal_cli.studies.study import median_curves
+    from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
 
     tolerance = 0.0 if study.noisy else study.tolerance
-    plot_convergence(study.subject, {study.conditions: curves(study, records)}, tolerance, path)
+    panels = {comparison_conditions(study): median_curves(study, records)[""]}
+    plot_convergence(comparison_subject(study), panels, tolerance, path)

@@ -15,8 +15,8 @@ from accelcal_cli.cli import options as running
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from accelcal_cli.navigation.ins import Grade
-    from accelcal_cli.navigation.study import FilterEntry, Navigation, Waters
+    from accelcal_cli.navigation.ins import InsGrade
+    from accelcal_cli.navigation.study import FilterEntry, Navigation, NavigationSettings
     from accelcal_cli.studies.study import Record
 
 MODES = ("default", "literal", "both")
@@ -97,7 +97,7 @@ def command(
     stated = {"map": map, "voyage": voyage, "period": period}
     settings = {"particles": particles, "generations": generations}
     study = _study(config, stated, filter or (), mode, settings, runs, seed, calibration)
-    inputs = [config, calibration, *study.waters.files()]
+    inputs = [config, calibration, *study.settings.files()]
     options.check_apart(inputs, {"-o": output, "--raw": raw, "--plot": plot})
     records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     show(study, records, format if output != "-" else "")
@@ -131,38 +131,34 @@ def _study(
     calibration: str | None,
 ) -> Navigation:
     """Return the study that file and command line state together."""
-    from accelcal_cli.navigation.study import Navigation, Repeats, load_waters
-    from accelcal_cli.schema import from_mapping
-    from accelcal_cli.studies.entries import words
+    from accelcal_cli.navigation.study import Navigation, load_study
+    from accelcal_cli.studies.study import words
 
-    waters, own, further = load_waters(config, stated)
-    filed: dict[str, Any] = {key: further[key] for key in ("runs", "seed") if key in further}
-    said = {key: value for key, value in (("runs", runs), ("seed", seed)) if value is not None}
-    repeats = from_mapping(Repeats, {**filed, **said}, str(config or "command line"))
-    entries = _entries(words(names), own, mode, settings)
-    grades: tuple[Grade, ...] = (waters.ins,)
+    filed = load_study(config, {**stated, "runs": runs, "seed": seed})
+    entries = _entries(words(names), filed.filters, mode, settings)
+    grades: tuple[InsGrade, ...] = (filed.ins,)
     if calibration is not None:
-        waters, grades = _calibrated(waters, calibration)
-    return Navigation(waters.hashed(), tuple(entries), grades, repeats.runs, repeats.seed)
+        filed, grades = _calibrated(filed, calibration)
+    return Navigation(filed.with_digests(), tuple(entries), grades)
 
 
 def _entries(
     names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, settings: dict[str, Any]
 ) -> list[FilterEntry]:
     """Return the filters by name or label, in the modes that were asked for."""
-    from accelcal_cli.navigation.study import FilterEntry, filter_names, limited
+    from accelcal_cli.navigation.study import FilterEntry, filter_names
 
-    stated = {entry.label: entry for entry in own}
+    stated = {entry.name: entry for entry in own}
     wanted = list(names) or list(stated) or [ALL]
     if ALL in wanted:
         wanted = list(dict.fromkeys([*stated, *filter_names()]))
-    chosen = [stated.get(name, FilterEntry(name, name)) for name in wanted]
+    chosen = [stated.get(name) or FilterEntry(name) for name in wanted]
     modes: list[str | None] = ["default", "literal"] if mode == "both" else [mode]
-    return [limited(entry, {**settings, "mode": each}) for each in modes for entry in chosen]
+    return [entry.with_settings({**settings, "mode": each}) for each in modes for entry in chosen]
 
 
-def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]:
-    """Return waters and the INS without and with a calibration.
+def _calibrated(settings: NavigationSettings, source: str) -> tuple[NavigationSettings, tuple[InsGrade, ...]]:
+    """Return the settings and the INS without and with a calibration.
 
     The accelerometers are strapped down: on a platform an alignment hides their biases. Any drift is taken that the
     filters can start with.
@@ -170,8 +166,8 @@ def _calibrated(waters: Waters, source: str) -> tuple[Waters, tuple[Grade, ...]]
     from accelcal_cli.navigation.study import grade_of
 
     result = options.load_result(source)
-    free = replace(waters, plan=replace(waters.plan, drift=(0.0, waters.initial)))
-    ins = replace(waters.ins, mounting="strapdown")
+    free = replace(settings, plan=replace(settings.plan, drift=(0.0, settings.initial)))
+    ins = replace(settings.ins, mounting="strapdown")
     return free, (ins, grade_of(result, ins, source))
 
 
@@ -205,18 +201,17 @@ def reproduce(
     quiet: bool,
 ) -> None:
     """Run a shipped experiment on navigation filters and print it beside the paper's numbers."""
-    from accelcal_cli.navigation.study import Navigation, load_waters
+    from accelcal_cli.navigation.study import Navigation, load_study
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.views.navigation import beside, summary
+    from accelcal_cli.views.navigation import summary, with_paper
 
-    waters, entries, further = load_waters(name, {})
-    number = further["seed"] if seed is None else seed
-    study = Navigation(waters, tuple(entries), (waters.ins,), runs or further["runs"], number)
+    settings = load_study(name, {"runs": runs, "seed": seed})
+    study = Navigation(settings, settings.filters, (settings.ins,))
     records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
-    table = beside(summary(study, records), further)
+    table = with_paper(summary(study, records), settings)
     if format == "json":
         parts = [{"title": table.title, "rows": json_rows([table])}]
-        sys.stdout.write(json_text({"name": name, "title": further["title"], "tables": parts}))
+        sys.stdout.write(json_text({"name": name, "title": settings.title, "tables": parts}))
     elif format == "csv":
         write_csv(table, sys.stdout)
     else:

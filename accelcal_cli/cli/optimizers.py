@@ -15,9 +15,10 @@ def command(
         str | None, typer.Argument(help="One optimizer: its settings and what they mean.", show_default="all")
     ] = None,
     format: options.Format = "table",
-    quiet: options.Quiet = False,  # noqa: ARG001  # every command takes it; this one never says more than it lists
+    quiet: options.Quiet = False,
 ) -> None:
     """List the optimizers, their settings and their papers."""
+    from accelcal_cli.optimization.optimizer import OPTIMIZERS
     from accelcal_cli.output.console import show
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
     from accelcal_cli.views.optimizers import catalogue, catalogue_blocks, flat, settings, settings_blocks
@@ -33,3 +34,6 @@ def command(
     else:
         show(catalogue_blocks(table))
     sys.stdout.flush()
+    if not quiet:
+        for fault in OPTIMIZERS.faults.values():
+            typer.echo(f"accelcal: {fault}", err=True)

@@ -353,7 +353,7 @@ def run(
     _check(raw, jobs, cluster, resume)
     from accelcal_cli.output.machine import write_table
     from accelcal_cli.studies.engine import Journal, run_study
-    from accelcal_cli.studies.study import raw_table
+    from accelcal_cli.views.studies import raw_table
 
     journal = Journal.open(Path(f"{raw}.journal") if raw else None, study, resume)
     try:

@@ -46,16 +46,18 @@ def command(
 
     options.check_format(format)
     if name is None:
-        _list(reproduce.catalogue(), format, [raw, plot, cluster, runs, seed])
+        from accelcal_cli.views.experiments import catalogue_table
+
+        _list(catalogue_table(), format, [raw, plot, cluster, runs, seed])
         return
     running.check_plot(plot)
-    if name in reproduce.voyages():
+    if name in reproduce.navigation_names():
         from accelcal_cli.cli import navigate
 
         navigate.reproduce(name, runs, seed, raw, jobs, cluster, resume, plot, format, quiet)
         return
     experiment = reproduce.load(name).changed(runs, seed)
-    records = running.run(experiment.study(), raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
+    records = running.run(experiment, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
     _show(experiment, records, format)
     if plot is not None:
         from accelcal_cli.output.plot import plot_convergence
@@ -84,9 +86,10 @@ def _list(table: Table, format: str, stated: Sequence[object]) -> None:
 
 def _show(experiment: Experiment, records: Sequence[Record], format: str) -> None:
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.reproduce import curves, tables
+    from accelcal_cli.studies.reproduce import curves
+    from accelcal_cli.views.experiments import experiment_tables
 
-    shown = tables(experiment, records)
+    shown = experiment_tables(experiment, records)
     if format == "json":
         parts = [{"title": table.title, "rows": json_rows([table])} for table in shown]
         sys.stdout.write(json_text({"name": experiment.name, "title": experiment.title, "tables": parts}))
@@ -96,7 +99,7 @@ def _show(experiment: Experiment, records: Sequence[Record], format: str) -> Non
             write_csv(table, sys.stdout)
     else:
         from accelcal_cli.output.console import show
-        from accelcal_cli.views.blocks import study
+        from accelcal_cli.views.studies import study_blocks
 
-        show(study(experiment.title, shown, curves(experiment, records, shown=True), experiment.note))
+        show(study_blocks(experiment.title, shown, curves(experiment, records, shown=True), experiment.note))
     sys.stdout.flush()

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from accelcal_cli.calibration.assess import at_edge
-from accelcal_cli.calibration.fit import modulus_errors, square_error
+from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.observability import Observability, attitudes, directions_of, information
-from accelcal_cli.calibration.search import fitted, model_at, opened, shared_weights
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import search, state
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.detection.intervals import Found, Intervals, Ints, Level, find_intervals, find_level, merge
 from accelcal_cli.detection.rawlog import RawLog
@@ -316,31 +316,20 @@ class Screened:
 
 def screen(readings: Readings, g: float) -> Screened:
     """Calibrate readings that carry count and scatter, weighted by both and by what the poses share."""
-    settings = Settings(g=g)
-    rough = _rough(readings, settings)
-    if rough is not None:
-        return rough
-    problem, x = fitted(readings, settings, shared_weights(readings, settings))
-    model = model_at(problem, x)
-    seen = Observability.of(information(problem, x)[0], readings.poses)
-    freedom = readings.poses - 9
-    cost = float(problem.cost(x[:, None])[0, 0])
-    s = np.sqrt(cost / (4.0 * g**2) / freedom) if freedom > 0 else np.nan
-    square = sum(square_error(e, g) for _, e, _ in modulus_errors(readings, model, g))
+    sample, settings = Sample.of([readings]), Settings("levenberg-marquardt", g=g, weights="auto")
+    plain = state(sample, replace(settings, weights="none"))
+    if plain.start.sources[0] == "sphere":
+        # Where the poses determine no more than the nearest sphere, no search has to find that out.
+        middle = np.zeros_like(plain.cost.box.centre)
+        if Observability.of(information(plain.cost, middle)[0], readings.poses).verdict == "undetermined":
+            K, D = plain.cost.parameters(middle)
+            return Screened(ErrorModel(K[0], D[0]), np.nan, np.nan, np.inf, "undetermined")
+    result = fit(search(state(sample, settings), closed=True))
+    view = result.observability[0]
     return Screened(
-        model,
-        float(np.sqrt(square / readings.poses)),
-        float(s),
-        seen.worst,
-        "undetermined" if at_edge(x).any() else seen.verdict,
+        ErrorModel(result.lower[0], result.D[0]),
+        float(result.rms[0]),
+        float(result.s[0]),
+        float(view.worst),
+        "undetermined" if result.at_wall.any() else view.verdict,
     )
-
-
-def _rough(readings: Readings, settings: Settings) -> Screened | None:
-    """Return the nearest sphere where the poses determine no more, so that no search has to find that out."""
-    problem, start = opened(readings, settings, None)
-    middle = np.zeros_like(problem.box.centre)
-    seen = Observability.of(information(problem, middle)[0], readings.poses)
-    if start.source != "sphere" or seen.verdict != "undetermined":
-        return None
-    return Screened(model_at(problem, middle), np.nan, np.nan, np.inf, seen.verdict)

@@ -87,6 +87,12 @@ class Readings:
         )
         return cls._of(collector, extras, hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest(), None)
 
+    def with_output(self, output: Float) -> Self:
+        """Return the same poses with other outputs, shape (J, 3)."""
+        store = RowStore()
+        store.append(output)
+        return replace(self, lower=output.min(axis=0), upper=output.max(axis=0), _store=store)
+
     def known_as(
         self,
         sha256: str,

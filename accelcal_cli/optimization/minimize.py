@@ -8,30 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.arrays import Float, Int
-from accelcal_cli.optimization.optimizer import CONVERGED, FAILED, Optimizer, take
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.optimization.optimizer import Optimizer, S, Status, take
 from accelcal_cli.optimization.problem import Counted, Problem
 from accelcal_cli.rng import Streams
+
+N = TypeVar("N", bound=np.generic)
 
 BLOCK_BYTES = 192 * 1024
 """Runs go through the loop in blocks whose population fits this many bytes, twenty runs of 100 x 12: enough to
 hide the interpreter, and a handful of temporaries of that size still fits the second-level cache."""
-
-
-class Status(Enum):
-    """How a run ended."""
-
-    ITERATIONS = "all iterations used"
-    EVALUATIONS = "evaluation budget used"
-    TOLERANCE = "cost reached the tolerance"
-    CONVERGED = "converged"
-    FAILED = "numerical failure"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +35,7 @@ class Run:
         cost: its cost, shape (R,).
         evaluations: evaluations used, shape (R,).
         iterations: steps made, shape (R,).
-        status: how each ended.
+        status: how each ended; `Status.message` says it in words.
         trace: best cost so far after every step, shape (R, K + 1), the last value repeated after a run's end;
             None when no trace was asked for.
         trace_evaluations: evaluations after every step, same shape.
@@ -78,7 +69,7 @@ NEVER = Stopping()
 
 def minimize(
     problem: Problem,
-    optimizer: Optimizer,
+    optimizer: Optimizer[S],
     *,
     runs: int | Sequence[int] = 1,
     seed: int = 0,
@@ -100,7 +91,7 @@ def minimize(
         progress: called with (steps done, steps at most) of all runs together, now and then.
     """
     numbers = np.arange(runs) if isinstance(runs, int) else np.asarray(runs, dtype=np.int64)
-    size = max(1, BLOCK_BYTES // (8 * optimizer.crowd * problem.dimensions))
+    size = max(1, BLOCK_BYTES // (8 * optimizer.points_per_run * problem.dimensions))
     # Freed at once: from now on glibc keeps smaller blocks instead of faulting them in anew.
     np.empty(1 << 20)
     parts = []
@@ -115,14 +106,15 @@ def minimize(
     return parts[0] if len(parts) == 1 else _join(parts)
 
 
-class _Loop:
+class _Loop(Generic[S]):
     """One block of runs; those that end leave the batch, the others go on."""
 
-    def __init__(self, problem: Problem, optimizer: Optimizer, stopping: Stopping, trace: bool) -> None:
+    def __init__(self, problem: Problem, optimizer: Optimizer[S], stopping: Stopping, trace: bool) -> None:
         self.problem, self.optimizer, self.stopping, self.trace = problem, optimizer, stopping, trace
         self.endless = stopping == NEVER
 
     def run(self, numbers: NDArray[np.int64], seed: int, x: Float | None) -> Run:
+        """Return the outcome of the runs of these numbers, from the population x or a sampled one."""
         runs = len(numbers)
         self.alive: Int = np.arange(runs)
         self.rng, self.counted = Streams(seed, numbers.tolist()), Counted(self.problem, runs)
@@ -134,52 +126,51 @@ class _Loop:
         if x is None:
             lower, upper = self.problem.start or (self.problem.lower, self.problem.upper)
             x = lower + (upper - lower) * self.rng.uniform(self.optimizer.population, lower.size)
-        state = self._noted(self.optimizer.init(self.counted, x, self.rng))
+        state = self._record(self.optimizer.init(self.counted, x, self.rng))
         for k in range(self.optimizer.iterations):
-            state = self._retired(state, k)
+            state = self._retire(state, k)
             if not len(self.alive):
                 break
-            state = self._noted(self.optimizer.step(self.counted, state, self.rng))
+            state = self._record(self.optimizer.step(self.counted, state, self.rng))
         else:
-            self._retired(state, self.optimizer.iterations)
+            self._retire(state, self.optimizer.iterations)
             self._leave(np.arange(len(self.alive)), self.optimizer.iterations)
         return self._outcome(numbers)
 
-    def _noted(self, state: Any) -> Any:
-        """Return the state, its best costs entered in the trace."""
+    def _record(self, state: S) -> S:
+        """Enter the best costs in the trace, and return the state."""
         if self.trace:
             # Counted replaces this array when a run improves and never writes into it: no copy is needed.
             self.costs.append((self.alive, self.counted.best_cost))
             self.counts.append(self.counted.spent)
         return state
 
-    def _retired(self, state: Any, k: int) -> Any:
+    def _retire(self, state: S, k: int) -> S:
         """Return the state without the runs that have ended after k steps."""
         if state.status is None and self.endless:
             return state
-        checks = self._checks(state)
-        if not any(which.any() for _, which in checks):
+        reasons = self._reasons(state.status)
+        if not any(ended.any() for _, ended in reasons):
             return state
-        for status, which in checks:
-            for i in np.flatnonzero(which):
-                self.status[self.alive[i]] = status
-        ended = np.logical_or.reduce([which for _, which in checks])
-        self._leave(np.flatnonzero(ended), k)
-        keep = np.flatnonzero(~ended)
-        self.alive, self.counted, self.rng = self.alive[keep], self.counted.take(keep), self.rng.take(keep)
-        return take(state, keep)
+        for status, ended in reasons:
+            for run in self.alive[ended]:
+                self.status[run] = status
+        over = np.logical_or.reduce([ended for _, ended in reasons])
+        self._leave(np.flatnonzero(over), k)
+        rest = np.flatnonzero(~over)
+        self.alive, self.counted, self.rng = self.alive[rest], self.counted.take(rest), self.rng.take(rest)
+        return take(state, rest)
 
-    def _checks(self, state: Any) -> list[tuple[Status, NDArray[np.bool_]]]:
+    def _reasons(self, status: NDArray[np.int8] | None) -> list[tuple[Status, Bool]]:
         """Return each reason to end and the runs it holds for, the weightiest reason last."""
-        checks = []
+        reasons: list[tuple[Status, Bool]] = []
         if self.stopping.evaluations is not None:
-            checks.append((Status.EVALUATIONS, self.counted.evaluations >= self.stopping.evaluations))
-        if state.status is not None:
-            checks.append((Status.FAILED, state.status == FAILED))
-            checks.append((Status.CONVERGED, state.status == CONVERGED))
+            reasons.append((Status.EVALUATIONS, self.counted.evaluations >= self.stopping.evaluations))
+        if status is not None:
+            reasons += [(reason, status == reason) for reason in (Status.FAILED, Status.CONVERGED)]
         if self.stopping.tolerance is not None:
-            checks.append((Status.TOLERANCE, self.counted.best_cost <= self.stopping.tolerance))
-        return checks
+            reasons.append((Status.TOLERANCE, self.counted.best_cost <= self.stopping.tolerance))
+        return reasons
 
     def _leave(self, index: Int, k: int) -> None:
         """Enter the results of the runs at `index` of those alive, which have made k steps."""
@@ -188,6 +179,7 @@ class _Loop:
         self.steps[runs], self.evaluations[runs] = k, counted.spent
 
     def _outcome(self, numbers: NDArray[np.int64]) -> Run:
+        """Return the results of all runs; one without a finite cost has failed."""
         status = tuple(
             s if np.isfinite(c) else Status.FAILED for s, c in zip(self.status, self.best_cost, strict=True)
         )
@@ -207,23 +199,22 @@ class _Loop:
 
 
 def _join(parts: list[Run]) -> Run:
-    def stack(name: str) -> NDArray[np.float64]:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    def pad(name: str) -> NDArray[np.float64] | None:
-        if getattr(parts[0], name) is None:
-            return None
-        longest = max(getattr(part, name).shape[1] for part in parts)
-        rows = [getattr(part, name) for part in parts]
-        return np.concatenate([np.pad(r, ((0, 0), (0, longest - r.shape[1])), mode="edge") for r in rows])
-
+    """Return the outcome of the runs of all parts, their traces as long as the longest."""
+    traces = [part.trace for part in parts if part.trace is not None]
+    counts = [part.trace_evaluations for part in parts if part.trace_evaluations is not None]
     return Run(
-        stack("runs").astype(np.int64),
-        stack("x"),
-        stack("cost"),
-        stack("evaluations").astype(np.int64),
-        stack("iterations").astype(np.int64),
-        tuple(s for part in parts for s in part.status),
-        pad("trace"),
-        pad("trace_evaluations"),  # type: ignore[arg-type]
+        np.concatenate([part.runs for part in parts]),
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.cost for part in parts]),
+        np.concatenate([part.evaluations for part in parts]),
+        np.concatenate([part.iterations for part in parts]),
+        tuple(status for part in parts for status in part.status),
+        np.concatenate(_padded(traces)) if traces else None,
+        np.concatenate(_padded(counts)) if counts else None,
     )
+
+
+def _padded(traces: list[NDArray[N]]) -> list[NDArray[N]]:
+    """Return arrays of shape (R, K) as wide as the widest, the last value of each row repeated."""
+    longest = max(trace.shape[1] for trace in traces)
+    return [np.pad(trace, ((0, 0), (0, longest - trace.shape[1])), mode="edge") for trace in traces]

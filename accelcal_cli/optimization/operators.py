@@ -3,36 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.optimization.problem import Bound, points
-from accelcal_cli.rng import Streams
-
-AHEAD = 1600
-"""Points whose chances are drawn at once: several iterations of a small batch."""
-
-Chance = tuple[NDArray[Any], ...]
-"""What chance decides in one iteration: arrays of shape (R, ...)."""
-
-
-def drawn(rng: Streams, fx: Float, rows: int, columns: int) -> Float:
-    """Return uniform numbers for the iterations to come, shape (R, K, rows, columns), population-contiguous.
-
-    K shrinks with the batch fx, shape (R, P). Each run draws in the order of its iterations, so that its numbers
-    do not depend on its company.
-    """
-    steps = max(1, AHEAD // fx.size)
-    u = rng.uniform(rows, steps * columns).transpose(0, 2, 1)
-    return u.reshape(len(fx), steps, columns, rows).swapaxes(2, 3)
-
-
-def each(*parts: NDArray[Any]) -> tuple[Chance, ...]:
-    """Return arrays of shape (R, K, ...) as the chances of K iterations, one entry an iteration."""
-    return tuple(zip(*(part.swapaxes(0, 1) for part in parts), strict=True))
 
 
 def gather(x: Float, index: Int) -> Float:
@@ -94,3 +69,17 @@ def partners(picks: Int) -> tuple[Int, Int]:
     picks += np.arange(1, size + 1)
     picks -= size * (picks >= size)
     return first, second
+
+
+def mutated_genes(u: Float, keep: float, gene: Int) -> Float:
+    """Return 1 where a trial takes the mutant's gene, 0 where its parent's, shape (R, K, P, D), [dpso2014] eq. 5.
+
+    Args:
+        u: uniform numbers, one per gene, shape (R, K, P, D) of K iterations.
+        keep: P_c, the probability to keep the parent's gene.
+        gene: J_rand, the gene always taken from the mutant, shape (R, K, P).
+    """
+    mutated = (u > keep).astype(float)
+    runs, iterations, individuals = (np.arange(size) for size in gene.shape)
+    mutated[runs[:, None, None], iterations[:, None], individuals, gene] = 1.0
+    return mutated

@@ -1,7 +1,7 @@
 """What every optimizer is: a frozen dataclass of settings with two pure methods, `init` and `step`.
 
 Shapes: R runs, P points of the population, D dimensions. Arrays of shape (R, P, D) keep the population axis
-contiguous in memory (see `streams`).
+contiguous in memory (see `rng`).
 """
 
 from __future__ import annotations
@@ -9,29 +9,53 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float, Int
+from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import check, setting
 
-RUNNING, CONVERGED, FAILED = 0, 1, 2
-"""Values of `State.status`: go on, nothing left to gain, numerical failure."""
+
+class Status(IntEnum):
+    """How a run stands, or how it ended; `message` says it to a reader.
+
+    An optimizer states the first three in `State.status`; the others are `minimize`'s.
+    """
+
+    RUNNING = 0, "The run goes on."
+    CONVERGED = 1, "The algorithm converged: it has nothing left to gain."
+    FAILED = 2, "Numerical failure: no finite cost, or no step that can be computed."
+    ITERATIONS = 3, "All iterations were used."
+    EVALUATIONS = 4, "The budget of evaluations was used."
+    TOLERANCE = 5, "The cost reached the tolerance."
+
+    message: str
+
+    def __new__(cls, value: int, message: str) -> Status:
+        """Return the number with its message."""
+        member = int.__new__(cls, value)
+        member._value_, member.message = value, message
+        return member
 
 
 @dataclass(frozen=True, eq=False)
 class State:
     """What an optimizer carries from step to step; each algorithm adds its own fields.
 
+    Every array has the runs as its first axis; what is not an array is common to all runs.
+
     Attributes:
         x: the population, shape (R, P, D).
         fx: its cost, shape (R, P).
-        status: None, or RUNNING, CONVERGED or FAILED for each run, shape (R,).
+        status: None while all runs go on, or RUNNING, CONVERGED or FAILED for each run, shape (R,).
     """
 
     x: Float
@@ -43,41 +67,42 @@ S = TypeVar("S", bound=State)
 
 
 def take(state: S, index: Int) -> S:
-    """Return the state of the runs at `index`; every array in it and its parts has the runs as its first axis."""
-    parts = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
-    return dataclasses.replace(state, **{k: _taken(v, index) for k, v in parts.items()})
-
-
-def _taken(part: Any, index: Int) -> Any:
-    if isinstance(part, np.ndarray):
-        return part[index]
-    if isinstance(part, tuple):
-        return tuple(_taken(one, index) for one in part)
-    held: Any = part if dataclasses.is_dataclass(part) else None
-    return part if held is None else take(held, index)
+    """Return the state of the runs at `index`."""
+    parts = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    return dataclasses.replace(state, **{k: v[index] for k, v in parts.items() if isinstance(v, np.ndarray)})
 
 
 @dataclass(frozen=True)
-class Optimizer(ABC):
-    """Base of all optimizers; the fields of a subclass are its YAML keys."""
+class Optimizer(ABC, Generic[S]):
+    """Base of all optimizers, generic in their State; the fields of a subclass are its YAML keys."""
 
     name: ClassVar[str]
     family: ClassVar[str]
+    """What kind of algorithm it is, in a word or two."""
     paper: ClassVar[str]
     """Key of docs/bibliography.md."""
     needs: ClassVar[tuple[str, ...]] = ()
     """What the problem must offer: "residuals", "closed_form"."""
+    converges: ClassVar[bool] = True
+    """False for a search whose radius or noise never shrinks, so that the cost stays on a floor."""
 
     population: int = setting(100, "points that are evaluated together (N)", low=4, high=1_000_000)
     iterations: int = setting(500, "steps at most (k_max)", low=1, high=100_000_000)
+
+    def __init_subclass__(cls) -> None:
+        """Refuse a class that does not say what it is and where it comes from."""
+        super().__init_subclass__()
+        for attribute in ("family", "paper", "__doc__"):
+            if not getattr(cls, attribute, None):
+                raise TypeError(f"optimizer class {cls.__name__} lacks {attribute}")
 
     def __post_init__(self) -> None:
         """Refuse a setting outside its range."""
         check(self)
 
     @property
-    def crowd(self) -> int:
-        """Points of one run that pass through the memory in a step: how many runs make a block that fits the cache."""
+    def points_per_run(self) -> int:
+        """Points of one run that a step evaluates, which decides how many runs make a block that fits the cache."""
         return self.population
 
     def suits(self, problem: Problem) -> bool:
@@ -85,12 +110,30 @@ class Optimizer(ABC):
         return all(getattr(problem, f"has_{need}") for need in self.needs)
 
     @abstractmethod
-    def init(self, problem: Problem, x: Float, rng: Streams) -> Any:
+    def init(self, problem: Problem, x: Float, rng: Streams) -> S:
         """Return the first State from a starting population x, shape (R, P, D)."""
 
     @abstractmethod
-    def step(self, problem: Problem, state: Any, rng: Streams) -> Any:
+    def step(self, problem: Problem, state: S, rng: Streams) -> S:
         """Return the State after one iteration of all R runs."""
 
 
-OPTIMIZERS: Registry[Optimizer] = Registry("accelcal_cli.optimization.algorithms", "optimizer")
+OPTIMIZERS: Registry[Optimizer[State]] = Registry(
+    Optimizer, "accelcal_cli.optimization.algorithms", "optimizer", "accelcal.optimizers"
+)
+"""All optimizers by name. One that comes from here takes the States that it returned, and no others."""
+
+
+def optimizer_file(name: str) -> Path | None:
+    """Return the YAML file of an optimizer, None where there is none.
+
+    That is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
+    """
+    return shipped("optimizers").get(name) or OPTIMIZERS.beside(name, ".yaml")
+
+
+def shipped_parameters(optimizer: Any) -> dict[str, Any]:
+    """Return the settings that the file of an optimizer states; none for an unknown one."""
+    path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
+    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
+    return parameters

@@ -14,6 +14,7 @@ New readings that no ageing of a sensor explains: another unit than those of the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -25,19 +26,12 @@ from accelcal_cli.calibration import distributions as chances
 from accelcal_cli.calibration import observability as quality
 from accelcal_cli.calibration.assess import is_large, large_residuals, not_fitting, ratio_in_words
 from accelcal_cli.calibration.distributions import Noise, Pair
-from accelcal_cli.calibration.fit import (
-    beyond_chance,
-    leverages,
-    modulus_errors,
-    room_of,
-    square_error,
-    studentise,
-)
+from accelcal_cli.calibration.fit import beyond_chance, length_error, leverages, room_of, studentise
 from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED, Observability, design
 from accelcal_cli.calibration.problem import ROWS_COLUMNS, Box, Loetters, compress, pack
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.calibration.search import model_at, polish
-from accelcal_cli.calibration.temperature import at
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import modulus_errors, polish
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.schema import to_mapping
@@ -188,7 +182,7 @@ def _verdict(chance: float, level: float, doubts: tuple[str, ...], readings: Rea
 def _rms(old: Calibration, readings: Readings) -> float:
     """Return the rms of |f| - g of the readings under the old result, in its unit of force."""
     model = old.model.in_gauge("lower")
-    squares = sum(square_error(e, old.g) for _, e, _ in modulus_errors(readings, model, old.g))
+    squares = sum(float(np.sum(length_error(e, old.g) ** 2)) for _, e, _ in _errors(readings, model, old.g))
     return float(np.sqrt(squares / readings.poses))
 
 
@@ -218,7 +212,7 @@ def _at_reference(old: Calibration, readings: Readings) -> tuple[Readings, tuple
             f"The new readings have no temperatures; they are taken to be at {held:.4g} degrees.",
         )
     brought = old.temperature.at_reference(readings.output(), readings.temperature, old.D_a)
-    return at(readings, brought), ()
+    return readings.with_output(brought), ()
 
 
 def _differences(found: Shift, tests: Tests, level: float) -> tuple[Difference, ...]:
@@ -316,7 +310,8 @@ def shift(old: Calibration, readings: Readings) -> Shift:
     cofactor = Observability.of(quality.information(problem, x)[0], readings.poses).cofactor
     value = _between(problem, start, x)
     noise = Noise(variance, readings.poses - 9)
-    return Shift(value, cofactor, np.eye(9), np.ones(9, bool), noise, model_at(problem, x), np.zeros(9))
+    (K,), (D,) = problem.parameters(x)
+    return Shift(value, cofactor, np.eye(9), np.ones(9, bool), noise, ErrorModel(K, D), np.zeros(9))
 
 
 def _problem(old: Calibration, readings: Readings) -> Loetters:
@@ -326,8 +321,9 @@ def _problem(old: Calibration, readings: Readings) -> Loetters:
     half = np.concatenate(
         [FARTHEST[0] * scale, np.full(3, FARTHEST[1] * scale.mean()), FARTHEST[2] * old.g * scale]
     )
-    blocks = ((block, None) for _, block in readings.blocks())
-    triangle = compress(blocks, model.D, old.g * float(scale.mean()))
+    blocks = ((block[None], None) for _, block in readings.blocks())
+    size = np.array([old.g * float(scale.mean())])
+    triangle = compress(blocks, model.D[None], size, np.array([readings.poses]))
     return Loetters(triangle, old.g, Box(pack(model.K, model.D, 9)[None], half[None]))
 
 
@@ -434,7 +430,7 @@ def _outlying(found: Shift, pair: Pair, readings: Readings, g: float) -> list[in
     if freedom < 2:
         return []
     numbers: list[int] = []
-    for first, e, f in modulus_errors(readings, found.model, g):
+    for first, e, f in _errors(readings, found.model, g):
         room = room_of(leverages(_rows(f), np.ones(len(e)), found.cofactor))
         left = e + design(f / g) @ found.step
         numbers += _beyond(
@@ -447,7 +443,7 @@ def _few_off(old: Calibration, readings: Readings) -> list[int]:
     """Return the numbers of the poses beyond chance off the result, if the others, most of them, are not."""
     cofactor = old.covariance / old.s**2
     parts = []
-    for _, e, f in modulus_errors(readings, old.model.in_gauge("lower"), old.g):
+    for _, e, f in _errors(readings, old.model.in_gauge("lower"), old.g):
         rows = _rows(f)
         parts.append(e / (old.s * np.sqrt(1.0 + np.sum((rows @ cofactor) * rows, axis=1))))
     t = np.concatenate(parts)
@@ -457,6 +453,12 @@ def _few_off(old: Calibration, readings: Readings) -> list[int]:
     return numbers if len(numbers) <= FEW * readings.poses else []
 
 
+def _errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[tuple[int, Float, Float]]:
+    """Yield (first pose, e, f) of one sensor block by block, shapes (B,) and (B, 3); see `modulus_errors`."""
+    for first, e, f in modulus_errors(Sample.of([readings]), model.K[None], model.D[None], g):
+        yield first, e[0], f[0]
+
+
 def _rows(f: Float) -> Float:
     """Return the design of poses by the directions of their force, shape (B, 9)."""
     return design(f / np.linalg.norm(f, axis=1, keepdims=True))
@@ -464,7 +466,7 @@ def _rows(f: Float) -> Float:
 
 def _beyond(first: int, t: Float, readings: Readings, freedom: int) -> list[int]:
     """Return the numbers of the poses of a block whose studentised residual, shape (B,), is beyond chance."""
-    beyond = beyond_chance(np.abs(t), np.full(len(t), readings.poses), np.full(len(t), freedom))
+    beyond = beyond_chance(np.abs(t), np.array(readings.poses), np.array(freedom))
     found: list[int] = (first + np.flatnonzero(beyond)).tolist()
     return found
 
@@ -491,9 +493,7 @@ def check_unit(old: Calibration, readings: Readings) -> None:
         DataError: each of them misses g by half of it or more; the message says what unit that looks like.
     """
     model = old.model.in_gauge("lower")
-    sizes = np.concatenate(
-        [np.linalg.norm(f, axis=1) / old.g for _, _, f in modulus_errors(readings, model, old.g)]
-    )
+    sizes = np.concatenate([np.linalg.norm(f, axis=1) / old.g for _, _, f in _errors(readings, model, old.g)])
     if (np.abs(sizes - 1.0) < STRANGE).any():
         return
     size = float(np.median(sizes))

@@ -7,8 +7,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from accelcal_cli.config import shipped_parameters
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, shipped_parameters
 from accelcal_cli.table import Column, Table
 from accelcal_cli.views.blocks import BLANK, Block, Paragraph
 

@@ -35,7 +35,7 @@ def test_residuals_that_are_large_beside_g_are_told(sigma, expected):
     """24 poses of 0.2 % and of 1 % of g: the verdict, which is of the poses, is good for both."""
     result = calibrate(readings(poses.turns(), sigma=sigma), FAST)
     assert result.verdict == "good"
-    assert any(_said(result, "of g, where 0.5%")) is expected
+    assert any(_said(result, "of g (above 0.5%")) is expected
     if expected:
         assert f"{result.s / G:.2%} of g" in result.cautions[0]
 
@@ -43,7 +43,7 @@ def test_residuals_that_are_large_beside_g_are_told(sigma, expected):
 def test_random_numbers_are_told():
     output = np.random.default_rng(1).uniform(-100, 100, (40, 3))
     result = calibrate(Readings.from_array(output), replace(FAST, g=1.0))
-    assert result.verdict == "undetermined" or any(_said(result, "of g, where"))
+    assert result.verdict == "undetermined" or any(_said(result, "of g (above"))
 
 
 def test_poses_that_do_not_fit_are_named_by_line():
@@ -52,17 +52,19 @@ def test_poses_that_do_not_fit_are_named_by_line():
     errors[7] += 0.03 * u[7]
     data = Readings.from_array(DPSO.output(G * u + errors))
     (caution,) = calibrate(data, FAST).cautions
-    assert caution == "Beyond chance off the others: pose 8. Measure it again, or use calibrate --robust."
+    assert caution == (
+        "Outlier: pose 8 does not fit the other poses (p < 0.01). Measure it again or add --robust huber."
+    )
     (caution,) = calibrate(data, replace(FAST, robust="huber")).cautions
-    assert caution == "Beyond chance off the others: pose 8. Measure it again."
+    assert caution == "Outlier: pose 8 does not fit the other poses (p < 0.01). Measure it again."
 
 
 def test_many_poses_that_do_not_fit_are_not_all_named():
     names = [f"line {n}" for n in range(2, 14)]
     (caution,) = cautions.not_fitting(names, 15)
     assert caution == (
-        "Beyond chance off the others: line 2, line 3, line 4, line 5, line 6, line 7, line 8, line 9 and 4 more. "
-        "Measure them again."
+        "Outliers: line 2, line 3, line 4, line 5, line 6, line 7, line 8, line 9 and 4 more do not fit the other "
+        "poses (p < 0.01). Measure them again."
     )
     assert cautions.not_fitting([], 15) == ()
 
@@ -191,7 +193,7 @@ def test_the_noise_of_forty_clean_sets_is_not_told_of():
     [(1.9, 1e-9, False), (2.1, 1e-9, True), (5.0, 2e-3, False), (5.0, 5e-4, True), (None, None, False)],
 )
 def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio, chance, told):
-    said = cautions.cautions(FAST, FAST.runs, 0.0, 1e-3, 15, 1e-3, (ratio, chance), [])
+    said = cautions.more_than_noise(ratio, chance)
     assert [f"{ratio:.2g} times what the scatter" in line for line in said] == [True] * told
 
 
@@ -201,7 +203,7 @@ def test_the_bias_that_is_stated_is_the_one_of_the_scale_factors(part):
     u = noise(40_000, 1.0, 3)
     u /= np.linalg.norm(u, axis=1)[:, None]
     result = calibrate(readings(u, sigma=part * G), FAST)
-    (caution,) = [line for line in result.cautions if "too large" in line]
+    (caution,) = [line for line in result.cautions if "% too large" in line]
     stated = float(re.search(r"about ([\d.]+)% too large", caution)[1])
     measured = 100 * np.mean(np.diagonal(result.K_a) / np.diagonal(DPSO.in_gauge("lower").K) - 1.0)
     assert stated == pytest.approx(measured, abs=0.05 + 0.06 * measured)
@@ -210,9 +212,9 @@ def test_the_bias_that_is_stated_is_the_one_of_the_scale_factors(part):
 def test_large_residuals_are_told_beyond_the_chance_of_their_estimate():
     """Twelve poses at 0.4 % of g, three degrees of freedom: an estimate in four is above 0.5 %, none is told."""
     told = [calibrate(readings(poses.edges(), sigma=0.04, seed=seed), FAST).cautions for seed in range(100)]
-    assert sum(any("of g, where" in text for text in said) for said in told) <= 3
+    assert sum(any("of g (above" in text for text in said) for said in told) <= 3
     told = [calibrate(readings(poses.turns(), sigma=0.2, seed=seed), FAST).cautions for seed in range(20)]
-    assert all(any("of g, where" in text for text in said) for said in told)
+    assert all(any("of g (above" in text for text in said) for said in told)
 
 
 def test_poses_that_stand_in_for_each_other_are_said_to():
@@ -220,7 +222,9 @@ def test_poses_that_stand_in_for_each_other_are_said_to():
     force = G * poses.edges() + noise(12, 1e-3, 2)
     force[4] *= 1.05
     (caution,) = (
-        text for text in calibrate(Readings.from_array(DPSO.output(force)), FAST).cautions if "others" in text
+        text
+        for text in calibrate(Readings.from_array(DPSO.output(force)), FAST).cautions
+        if "Outlier" in text
     )
     assert "pose 5" in caution
     assert caution.endswith("With so few poses one can take the blame of another.")

@@ -22,16 +22,16 @@ def _readings(count, seed, sigma=0.05):
 
 def _middle(output):
     low, high = output.min(axis=0), output.max(axis=0)
-    return 0.5 * (low + high), float(0.5 * (high - low).max())
+    return 0.5 * (low + high)[None], np.array([0.5 * (high - low).max()])
 
 
 def _compressed(output, weights, chunk):
     centre, scale = _middle(output)
     blocks = (
-        (output[i : i + chunk], None if weights is None else weights[i : i + chunk])
+        (output[None, i : i + chunk], None if weights is None else weights[None, i : i + chunk])
         for i in range(0, len(output), chunk)
     )
-    return compress(blocks, centre, scale)
+    return compress(blocks, centre, scale, np.array([len(output)]))
 
 
 def _agrees(triangle, output, weights, seed, tolerance=1e-11):

@@ -11,7 +11,8 @@ from simulated import MEMS, noise
 
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.observability import attitudes
-from accelcal_cli.calibration.search import shared_variance, shared_weights
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import shared_variance, state
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.detection.detect import MULTIPLIERS, TIE, Candidate, DetectSettings, best, detect
 from accelcal_cli.detection.rawlog import open_raw_log
@@ -51,6 +52,11 @@ RECORDINGS = [
     ("mikoff_mpu9150/imu0.log", 9.81, DetectSettings(g=9.81), IMU0, 20, 3.5e-3),
     ("mikoff_mpu9150/imu1.log", 9.81, DetectSettings(g=9.81), IMU1, 20, 3.5e-3),
 ]
+
+
+def _weights(readings):
+    """Weights auto, shape (J,)."""
+    return state(Sample.of([readings]), Settings(g=9.8, weights="auto")).weights[0]
 
 
 def detected(numbers, settings=None, **more):
@@ -237,8 +243,8 @@ def unequal(shared, seed):
 
 
 def test_weights_follow_the_noise_and_level_off():
-    noisy = shared_weights(unequal(0.0, 1), Settings(g=9.8))
-    model = shared_weights(unequal(0.05, 1), Settings(g=9.8))
+    noisy = _weights(unequal(0.0, 1))
+    model = _weights(unequal(0.05, 1))
     assert noisy[1] / noisy[0] > 5
     assert model[1] / model[0] < 1.5
     assert noisy.mean() == pytest.approx(1.0)
@@ -278,6 +284,6 @@ def test_a_pose_of_many_readings_is_not_taken_for_free_of_error():
     )
     own = [scatter**2 / n for n in count]
     expected = np.array([1.0 / (v + 0.01 * sum(own) / 24) for v in own])
-    weights = shared_weights(data, Settings(g=G, weights="auto"))
+    weights = _weights(data)
     np.testing.assert_allclose(weights, expected / expected.mean(), rtol=1e-3)
     assert weights.max() / weights.min() < 250

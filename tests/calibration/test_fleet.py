@@ -207,16 +207,18 @@ def test_weights_are_those_of_calibrate(tmp_path, weights):
 
 def test_weights_that_a_sensor_lacks_are_refused_with_its_name(tmp_path):
     path = write(tmp_path / "a.csv", {"left": rows_of(poses.turns(), 1)})
-    with pytest.raises(DataError, match='sensor "left": --weights n needs counts'):
-        calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="n"))
+    fleet = calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="n"))
+    assert fleet.verdict[0] == FAILED
+    assert fleet.reason[0] == '--weights n needs a column "n" or repeated readings per pose.'
 
 
 def test_a_standard_deviation_of_zero_is_no_weight(tmp_path):
     rows = np.column_stack([rows_of(poses.turns(), 1), np.full((len(poses.turns()), 4), 2.0)])
     rows[3, 4:] = 0.0
     path = write(tmp_path / "a.csv", {"stuck": rows}, "sensor,ax,ay,az,n,sx,sy,sz")
-    with pytest.raises(DataError, match=r'sensor "stuck": --weights sd needs .* above zero'):
-        calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
+    fleet = calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
+    assert fleet.verdict[0] == FAILED
+    assert re.match(r"--weights sd needs .* above zero", fleet.reason[0])
 
 
 def test_the_least_cost_of_the_ellipsoid_is_where_the_gradient_vanishes():
@@ -335,14 +337,14 @@ def test_a_broken_sensor_has_the_cautions_of_calibrate(clipped, tmp_path):
             LINE.sub("", text) for text in one.cautions
         ]
         assert fleet.caution[r] == " ".join(kept[r].cautions)
-    assert "Beyond chance off the others: line 295" in fleet.caution[12]
+    assert "Outlier: line 295 does not fit the other poses" in fleet.caution[12]
     assert counts(fleet) == "30 sensors: 30 good, 2 of them with a caution"
     (table,) = [t for t in summary(fleet, readings.sensors, [], G) if t.title == "Cautions"]
     assert [row[0] for row in table.rows] == ["S07", "S12"]
     assert table.rows[0][1] == pytest.approx(100 * fleet.s[7] / G)
-    assert table.rows[0][3].startswith("After calibration one pose errs by ")
+    assert table.rows[0][3].startswith("Residuals are too large")
     assert table.rows[0][3].endswith("is much for an accelerometer at rest")
-    assert table.rows[1][2:] == ("line 295", "Beyond chance off the others")
+    assert table.rows[1][2:] == ("line 295", "Outlier")
     rows = sensors(fleet, readings.sensors, []).records()
     assert [row["sensor"] for row in rows if row["caution"]] == ["S07", "S12"]
 

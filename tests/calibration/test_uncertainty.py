@@ -16,7 +16,8 @@ from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
-from accelcal_cli.optimization.minimize import Status, minimize
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 

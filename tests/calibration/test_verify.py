@@ -129,7 +129,7 @@ def test_much_more_noise_tells_nothing(times, told):
     assert any(f"have {told}" in line for line in found.reasons)
     assert any("hidden in the noise of the new readings: measure again" in line for line in found.reasons)
     assert not any(d.changed for d in found.differences)
-    assert any("of g, where 0.5%" in line for line in found.cautions) == (times > 5)
+    assert any("of g (above 0.5%" in line for line in found.cautions) == (times > 5)
 
 
 def test_a_change_that_noise_does_not_hide_is_one():
@@ -170,7 +170,7 @@ def test_a_pose_that_is_wrong_is_named(u):
     output[3] *= 1.1
     found = verify(result(), Readings.from_array(output))
     assert found.verdict == "inconclusive"
-    assert found.cautions[-1] == "Beyond chance off the others: pose 4. Measure it again."
+    assert found.cautions[-1] == "Outlier: pose 4 does not fit the other poses (p < 0.01). Measure it again."
 
 
 def test_a_pose_that_is_a_little_wrong_is_named_beside_the_verdict():
@@ -178,7 +178,9 @@ def test_a_pose_that_is_a_little_wrong_is_named_beside_the_verdict():
     output[3] *= 1.002
     found = verify(result(), Readings.from_array(output, labels=[f"p{k}" for k in range(24)]))
     assert found.verdict == "unchanged"
-    assert found.cautions == ('Beyond chance off the others: position "p3". Measure it again.',)
+    assert found.cautions == (
+        'Outlier: position "p3" does not fit the other poses (p < 0.01). Measure it again.',
+    )
     assert verify(result(), new()).cautions == ()
 
 

@@ -188,7 +188,7 @@ def test_undetermined_is_exit_1_and_names_what_is_missing(run):
     assert outcome.code == 1
     assert "Verdict: undetermined" in outcome.out
     assert "misalignment" in outcome.out
-    assert "Poses that would mend it" in outcome.out
+    assert "Add these poses" in outcome.out
 
 
 def test_repeated_readings_are_averaged_and_judged(run):
@@ -254,11 +254,11 @@ def test_cautions_stand_under_the_verdict_and_go_with_the_result(run):
     shown = run("calibrate", "noisy.csv", "--optimizer", "ellipsoid", "-o", "noisy.yaml", "--quiet")
     first, second, *_ = shown.out.splitlines()
     assert (first, shown.code, shown.err) == ("Verdict: good", 0, "")
-    assert second.startswith("Caution: After calibration one pose errs by ")
-    said = "accelcal: noisy.csv: caution: After calibration one pose errs by "
+    assert second.startswith("Caution: Residuals are too large")
+    said = "accelcal: noisy.csv: caution: Residuals are too large"
     for form in ("csv", "json"):
         assert said in run("calibrate", "noisy.csv", "--optimizer", "ellipsoid", "--format", form).err
-    said = "accelcal: noisy.yaml: caution: After calibration one pose errs by "
+    said = "accelcal: noisy.yaml: caution: Residuals are too large"
     assert run("export", "noisy.yaml", "--to", "imucal").err.startswith(said)
     assert run("apply", "noisy.yaml", "noisy.csv", "-o", "forces.csv").err.startswith(said)
     assert run("export", "noisy.yaml", "--to", "imucal", "--quiet").err == ""

@@ -88,7 +88,7 @@ def test_what_calibrate_says_of_the_poses_so_far_is_carried_on(run, tmp_path):
     record = json.loads(done.out)
     assert (done.code, record["verdict"]) == (1, "undetermined")
     assert record["so_far"] == {key: said[key] for key in ("verdict", "reasons", "cautions")}
-    assert "r.csv: caution: After calibration one pose errs by" in done.err
+    assert "r.csv: caution: Residuals are too large" in done.err
     assert run("plan", "r.csv", "--add", "2", "--format", "json", "-q").err == ""
     shown = run("plan", "r.csv", "--add", "2")
     assert (shown.code, shown.err) == (1, "")

@@ -29,7 +29,7 @@ LAMBDA = 1e-13
 
 @OPTIMIZERS.register("ade")
 @dataclass(frozen=True)
-class AdaptiveEvolution(Optimizer):
+class AdaptiveEvolution(Optimizer[State]):
     """Adaptive differential evolution of the DE-PF paper."""
 
     family = "evolution"

@@ -36,7 +36,7 @@ class KalmanState(State):
 
 @OPTIMIZERS.register("akpso")
 @dataclass(frozen=True)
-class AdaptiveKalmanSwarm(Optimizer):
+class AdaptiveKalmanSwarm(Optimizer[KalmanState]):
     """AKPSO with the constants of the paper, its filter in two states; `kalman_dim: 4` is the printed one."""
 
     family = "swarm"

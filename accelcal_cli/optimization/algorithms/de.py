@@ -10,17 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.optimization.operators import (
-    Chance,
     best_of,
     better_of,
-    drawn,
-    each,
     gather,
     integers,
+    mutated_genes,
     partners,
     press,
 )
@@ -30,30 +26,9 @@ from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
 
-def mutates(u: Float, share: float, gene: Int) -> Float:
-    """Return 1 where a trial takes the mutant's gene, 0 where its parent's, shape (R, K, P, D), [dpso2014] eq. 5.
-
-    Args:
-        u: uniform numbers, one a gene, shape (R, K, P, D).
-        share: P_c, the probability to keep the parent's gene.
-        gene: J_rand, the gene always taken from the mutant, shape (R, K, P).
-    """
-    taken = (u > share).astype(float)
-    runs, steps, individuals = (np.arange(size) for size in gene.shape)
-    taken[runs[:, None, None], steps[:, None], individuals, gene] = 1.0
-    return taken
-
-
-@dataclass(frozen=True, eq=False)
-class Generation(State):
-    """A population; x and fx are the individuals and their costs."""
-
-    chances: tuple[Chance, ...] = ()  # partners n, m and base vector, (R, 3, P); 1 where mutated, (R, P, D)
-
-
 @OPTIMIZERS.register("de")
 @dataclass(frozen=True)
-class DifferentialEvolution(Optimizer):
+class DifferentialEvolution(Optimizer[State]):
     """Differential evolution with greedy selection."""
 
     family = "evolution"
@@ -69,29 +44,29 @@ class DifferentialEvolution(Optimizer):
         "what the crossover probability keeps: parent as in the DPSO paper, mutant as in Storn and Price",
     )
 
-    def init(self, problem: Problem, x: Float, rng: Streams) -> Generation:
+    def init(self, problem: Problem, x: Float, rng: Streams) -> State:
         """Evaluate the starting population."""
-        return Generation(x, problem.cost(x))
+        return State(x, problem.cost(x))
 
-    def step(self, problem: Problem, state: Generation, rng: Streams) -> Generation:
+    def step(self, problem: Problem, state: State, rng: Streams) -> State:
         """Make one generation, all trials from the old population."""
         x, fx = state.x, state.fx
-        (picks, taken), *ahead = state.chances or self._draw(state, rng)
+        population, dimensions = x.shape[1:]
+        picks, mutated = rng.ahead(self._choices, population, 4 + dimensions)
         trial = self._change(x, fx, picks)
-        trial *= taken  # [dpso2014] eq. 5
+        trial *= mutated  # [dpso2014] eq. 5
         trial += x
         press(trial, *problem.limits)
-        return Generation(*better_of(x, fx, trial, problem.cost(trial)), tuple(ahead))  # [dpso2014] eq. 6
+        return State(*better_of(x, fx, trial, problem.cost(trial)))  # [dpso2014] eq. 6
 
-    def _draw(self, state: Generation, rng: Streams) -> tuple[Chance, ...]:
-        """Return partners and crossover of the generations to come."""
-        population, dimensions = state.x.shape[1:]
-        u = drawn(rng, state.fx, population, 4 + dimensions)
+    def _choices(self, u: Float) -> tuple[Int, Float]:
+        """Return n, m and base vector, shape (R, K, 3, P), and 1 where a trial takes the mutant's gene, else 0."""
+        population, dimensions = u.shape[2], u.shape[3] - 4
         picks = integers(u[..., :4], population - 1, population - 2, population, dimensions)
-        share = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover
-        taken = mutates(u[..., 4:], share, picks[..., 3, :])
+        keep = self.crossover if self.crossover_keeps == "parent" else 1.0 - self.crossover
+        mutated = mutated_genes(u[..., 4:], keep, picks[..., 3, :])
         partners(picks[..., :2, :])
-        return each(picks[..., :3, :], taken)
+        return picks[..., :3, :], mutated
 
     def _change(self, x: Float, fx: Float, picks: Int) -> Float:
         """Return what mutation adds to x, [dpso2014] eq. 3 and 4: (base - x) + F (x_n - x_m)."""

@@ -13,16 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.optimization.algorithms.de import mutates
-from accelcal_cli.optimization.algorithms.pso import pairs, velocity
+from accelcal_cli.optimization.algorithms.pso import velocity
 from accelcal_cli.optimization.operators import (
-    Chance,
     best_of,
     better_of,
-    drawn,
-    each,
     gather,
     integers,
+    mutated_genes,
     partners,
     press,
 )
@@ -41,14 +38,11 @@ class HybridState(State):
     memory_cost: Float  # (R, P)
     leader: Float  # common best, (R, D)
     iteration: int
-    chances: tuple[Chance, ...] = ()
-    """r1 and r2 of the swarm, (R, 2, P/2, D), partners n and m of the individuals, (R, 2, P/2), and 1 where a trial
-    takes the mutant's gene, 0 where its parent's, (R, P/2, D)."""
 
 
 @OPTIMIZERS.register("de-pso")
 @dataclass(frozen=True)
-class HybridSwarm(Optimizer):
+class HybridSwarm(Optimizer[HybridState]):
     """DE-PSO with the settings of the paper's calibration (section 4.2)."""
 
     family = "swarm and evolution"
@@ -79,50 +73,51 @@ class HybridSwarm(Optimizer):
 
     def step(self, problem: Problem, state: HybridState, rng: Streams) -> HybridState:
         """Move both halves once; one call evaluates them together."""
-        now, *ahead = state.chances or self._draw(state, rng)
-        x, v = self._moved(problem, state, now)
+        x, v = self._moved(problem, state, rng)
         fx = problem.cost(x)
         memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
         leader = best_of(memory, memory_cost)
-        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1, tuple(ahead))
+        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1)
 
-    def _moved(self, problem: Problem, state: HybridState, chance: Chance) -> tuple[Float, Float]:
+    def _moved(self, problem: Problem, state: HybridState, rng: Streams) -> tuple[Float, Float]:
         """Return both halves' next points and the swarm's velocities."""
-        (r, picks, taken), curve = chance, self._curve(state.iteration)
-        x, half = np.empty_like(state.x), state.velocity.shape[1]
+        (population, dimensions), half = state.x.shape[1:], state.velocity.shape[1]
+        r1, r2, picks, mutated = rng.ahead(self._choices, population - half, 3 * dimensions + 3)
+        x, curve = np.empty_like(state.x), self._curve(state.iteration)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
-        v = self._velocity(state, r, curve)
+        v = self._velocity(state, r1[:, :half], r2[:, :half], curve)
         press(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
         individuals = state.memory[:, half:].copy(order="K")
         change = self._change(individuals, state.leader, picks, curve)
-        change *= taken  # [dpso2014] eq. 5
+        change *= mutated  # [dpso2014] eq. 5
         np.add(individuals, change, out=x[:, half:])
         press(x, low, high)
         return x, v
 
-    def _draw(self, state: HybridState, rng: Streams) -> tuple[Chance, ...]:
-        """Return what chance decides in the iterations to come."""
-        population, dimensions = state.x.shape[1:]
-        half = state.velocity.shape[1]
-        rest = population - half
-        u = drawn(rng, state.fx, rest, 3 * dimensions + 3)
+    def _choices(self, u: Float) -> tuple[Float, Float, Int, Float]:
+        """Return r1 and r2, partners n and m, shape (R, K, 2, P/2), and where a trial takes the mutant's gene.
+
+        r1, r2 and the genes are of shape (R, K, P/2, D).
+        """
+        rest, dimensions = u.shape[2], u.shape[3] // 3 - 1
+        r1, r2, genes = (u[..., k * dimensions : (k + 1) * dimensions] for k in range(3))
         picks = integers(u[..., -3:], rest - 1, rest - 2, dimensions)
-        taken = mutates(u[..., 2 * dimensions : -3], self.crossover, picks[..., 2, :])
+        mutated = mutated_genes(genes, self.crossover, picks[..., 2, :])
         partners(picks[..., :2, :])
-        return each(pairs(u[:, :, :half, : 2 * dimensions]), picks[..., :2, :], taken)
+        return r1, r2, picks[..., :2, :], mutated
 
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
         return float(1.0 / (1.0 + self.curve_a * self.curve_b ** (100.0 * iteration / self.iterations)))
 
-    def _velocity(self, state: HybridState, r: Float, curve: float) -> Float:
+    def _velocity(self, state: HybridState, r1: Float, r2: Float, curve: float) -> Float:
         """Return the swarm's velocities before their limit."""
         half = state.velocity.shape[1]
         inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
         x, memory = state.x[:, :half], state.memory[:, :half]
-        return velocity(x, state.velocity, memory, state.leader, r, inertia, self.social, self.cognitive)
+        return velocity(x, state.velocity, memory, state.leader, r1, r2, inertia, self.social, self.cognitive)
 
     def _change(self, x: Float, leader: Float, picks: Int, curve: float) -> Float:
         """Return what mutation adds to the evolving half.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.optimization.optimizer import CONVERGED, FAILED, OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -19,7 +19,7 @@ from accelcal_cli.schema import setting
 
 @OPTIMIZERS.register("ellipsoid")
 @dataclass(frozen=True)
-class Ellipsoid(Optimizer):
+class Ellipsoid(Optimizer[State]):
     """The problem's closed form, evaluated once."""
 
     family = "closed form"
@@ -33,7 +33,7 @@ class Ellipsoid(Optimizer):
         """Evaluate the closed form; the starting point is not used."""
         solution = np.broadcast_to(problem.closed_form()[:, None, :], x.shape)
         fx = problem.cost(solution)
-        status = np.where(np.isfinite(fx[:, 0]), CONVERGED, FAILED).astype(np.int8)
+        status = np.where(np.isfinite(fx[:, 0]), Status.CONVERGED, Status.FAILED).astype(np.int8)
         return State(solution, fx, status=status)
 
     def step(self, problem: Problem, state: State, rng: Streams) -> State:

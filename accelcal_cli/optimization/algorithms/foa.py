@@ -29,11 +29,12 @@ class PlaneState(State):
 
 @OPTIMIZERS.register("foa")
 @dataclass(frozen=True)
-class FruitFly(Optimizer):
+class FruitFly(Optimizer[PlaneState]):
     """FOA as published: candidates are reciprocal distances."""
 
     family = "fruit fly"
     paper = "pan2012"
+    converges = False
 
     population: int = setting(50, "flies of a swarm (n)", low=4, high=1_000_000)
     iterations: int = setting(300, "generations (Maxgen)", low=1, high=100_000_000)

@@ -21,6 +21,7 @@ class FullFruitFly(ImprovedFruitFly):
     """IFOA with a fixed radius: p = 0."""
 
     paper = "ifoa2021"
+    converges = False
 
     def exponent(self, state: FlyState) -> Float:
         """Return p = 0 for every run, shape (R,)."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import CONVERGED, OPTIMIZERS, RUNNING, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -39,7 +39,7 @@ class FlyState(State):
 
 @OPTIMIZERS.register("ifoa")
 @dataclass(frozen=True)
-class ImprovedFruitFly(Optimizer):
+class ImprovedFruitFly(Optimizer[FlyState]):
     """IFOA: S = X and a radius that shrinks with the best cost."""
 
     family = "fruit fly"
@@ -83,7 +83,7 @@ class ImprovedFruitFly(Optimizer):
         axis = np.where(better[:, None, None], flies[rows, column][:, None], state.axis)
         # Below the spacing of doubles around the swarm no fly differs from it any more.
         stuck = (radius < np.spacing(np.abs(axis))).all(axis=(1, 2))
-        status = np.where(stuck, CONVERGED, RUNNING).astype(np.int8)
+        status = np.where(stuck, Status.CONVERGED, Status.RUNNING).astype(np.int8)
         smell = np.where(better, fx[rows, column], state.smell)
         return FlyState(flies, fx, axis, smell, state.threshold, status=status)
 

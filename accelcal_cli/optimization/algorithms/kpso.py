@@ -34,11 +34,12 @@ class FilterState(State):
 
 @OPTIMIZERS.register("kpso")
 @dataclass(frozen=True)
-class KalmanSwarm(Optimizer):
+class KalmanSwarm(Optimizer[FilterState]):
     """Kalman swarm of Monson and Seppi."""
 
     family = "swarm"
     paper = "monson2004"
+    converges = False
 
     noise: float = setting(
         0.01, "variance of start, process and observation as part of the range (epsilon)", above=0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.optimization.optimizer import CONVERGED, FAILED, OPTIMIZERS, RUNNING, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -33,7 +33,7 @@ class DampedState(State):
 
 @OPTIMIZERS.register("levenberg-marquardt")
 @dataclass(frozen=True)
-class LevenbergMarquardt(Optimizer):
+class LevenbergMarquardt(Optimizer[DampedState]):
     """Damped least squares; the classical reference."""
 
     family = "least squares"
@@ -84,8 +84,8 @@ class LevenbergMarquardt(Optimizer):
         done = (small | (trial_cost == 0) | (state.damping > 1e30)).all(axis=1)
         fx = np.where(better, trial_cost, fx)
         status = _status(fx)
-        status[done & (status == RUNNING)] = CONVERGED
-        status[~usable.any(axis=1)] = FAILED
+        status[done & (status == Status.RUNNING)] = Status.CONVERGED
+        status[~usable.any(axis=1)] = Status.FAILED
         return replace(
             state,
             x=x,
@@ -143,4 +143,4 @@ def _solutions(matrix: Float, right: Float) -> Float:
 
 
 def _status(fx: Float) -> np.ndarray[tuple[int], np.dtype[np.int8]]:
-    return np.where(np.isfinite(fx).any(axis=1), RUNNING, FAILED).astype(np.int8)
+    return np.where(np.isfinite(fx).any(axis=1), Status.RUNNING, Status.FAILED).astype(np.int8)

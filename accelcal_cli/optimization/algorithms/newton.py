@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.optimization.optimizer import CONVERGED, FAILED, OPTIMIZERS, RUNNING, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -23,7 +23,7 @@ SINGULAR = 1e-14
 
 @OPTIMIZERS.register("newton")
 @dataclass(frozen=True)
-class Newton(Optimizer):
+class Newton(Optimizer[State]):
     """Newton's iteration."""
 
     family = "least squares"
@@ -53,7 +53,9 @@ class Newton(Optimizer):
         small = np.abs(step).max(axis=2) <= self.step_tolerance * (problem.upper - problem.lower).max()
         lost = ~usable | ~np.isfinite(fx)
         status = np.where(
-            (small & usable).any(axis=1), CONVERGED, np.where(lost.all(axis=1), FAILED, RUNNING)
+            (small & usable).any(axis=1),
+            Status.CONVERGED,
+            np.where(lost.all(axis=1), Status.FAILED, Status.RUNNING),
         )
         return State(_kept(x, state.x, lost), fx, status=status.astype(np.int8))
 

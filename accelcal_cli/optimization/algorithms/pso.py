@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.optimization.operators import Chance, best_of, better_of, drawn, each, press
+from accelcal_cli.optimization.operators import best_of, better_of, press
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
@@ -27,37 +27,38 @@ class SwarmState(State):
     memory: Float  # pbest, (R, P, D)
     memory_cost: Float  # (R, P)
     leader: Float  # gbest, (R, D)
-    chances: tuple[Chance, ...] = ()  # r1 and r2, (R, 2, P, D)
-
-
-def pairs(u: Float) -> Float:
-    """Return the random numbers of both pulls side by side, shape (R, K, 2, P, D), from u, shape (R, K, P, 2 D)."""
-    runs, steps, population, columns = u.shape
-    return u.swapaxes(2, 3).reshape(runs, steps, 2, columns // 2, population).swapaxes(3, 4)
 
 
 def velocity(
-    x: Float, v: Float, memory: Float, leader: Float, r: Float, inertia: float, c1: float, c2: float
+    x: Float,
+    v: Float,
+    memory: Float,
+    leader: Float,
+    r1: Float,
+    r2: Float,
+    inertia: float,
+    social: float,
+    cognitive: float,
 ) -> Float:
-    """Return the new velocity, [dpso2014] eq. 1, where c1 goes with the global best.
+    """Return w v + c1 r1 (leader - x) + c2 r2 (memory - x), [dpso2014] eq. 1, where c1 goes with the global best.
 
-    All of shape (R, P, D), leader (R, D), r uniform of shape (R, 2, P, D).
+    All of shape (R, P, D), but leader (R, D); r1 and r2 are uniform numbers, inertia is w, social c1, cognitive c2.
     """
-    social = leader[:, None] - x
-    social *= r[:, 0]
-    social *= c1
-    cognitive = memory - x
-    cognitive *= r[:, 1]
-    cognitive *= c2
-    social += cognitive
+    to_leader = leader[:, None] - x
+    to_leader *= r1
+    to_leader *= social
+    to_memory = memory - x
+    to_memory *= r2
+    to_memory *= cognitive
+    to_leader += to_memory
     moved = v * inertia
-    moved += social
+    moved += to_leader
     return moved
 
 
 @OPTIMIZERS.register("pso")
 @dataclass(frozen=True)
-class ParticleSwarm(Optimizer):
+class ParticleSwarm(Optimizer[SwarmState]):
     """Particle swarm optimization."""
 
     family = "swarm"
@@ -76,11 +77,10 @@ class ParticleSwarm(Optimizer):
 
     def step(self, problem: Problem, state: SwarmState, rng: Streams) -> SwarmState:
         """Move the swarm once."""
-        x = state.x
-        (r,), *ahead = state.chances or self._draw(state, rng)
-        v = velocity(
-            x, state.velocity, state.memory, state.leader, r, self.inertia, self.social, self.cognitive
-        )
+        x, (population, dimensions) = state.x, state.x.shape[1:]
+        r1, r2 = rng.ahead(self._pulls, population, self.draws * 2 * dimensions)
+        pulls = self.inertia, self.social, self.cognitive
+        v = velocity(x, state.velocity, state.memory, state.leader, r1, r2, *pulls)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
         press(v, -limit, limit)
@@ -88,13 +88,10 @@ class ParticleSwarm(Optimizer):
         press(x, low, high)
         fx = problem.cost(x)
         memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)
-        return SwarmState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost), tuple(ahead))
+        return SwarmState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost))
 
-    def _draw(self, state: SwarmState, rng: Streams) -> tuple[Chance, ...]:
-        """Return r1 and r2 of the iterations to come, each the mean of `draws` uniform numbers."""
-        population, dimensions = state.x.shape[1:]
-        u = drawn(rng, state.fx, population, self.draws * 2 * dimensions)
-        if self.draws > 1:
-            parts = u.swapaxes(2, 3).reshape(*u.shape[:2], self.draws, 2 * dimensions, population)
-            u = (np.add.reduce(parts, axis=2) / self.draws).swapaxes(2, 3)
-        return each(pairs(u))
+    def _pulls(self, u: Float) -> tuple[Float, Float]:
+        """Return r1 and r2, each the mean of `draws` of the uniform numbers u, shape (R, K, P, D)."""
+        means = np.add.reduce(np.split(u, self.draws, axis=3)) / self.draws if self.draws > 1 else u
+        dimensions = means.shape[3] // 2
+        return means[..., :dimensions], means[..., dimensions:]

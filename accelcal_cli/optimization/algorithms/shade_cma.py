@@ -2,17 +2,14 @@
 
 Phase one is success-history adaptive differential evolution with linear population size reduction [tanabe2014]:
 current-to-pbest/1 with an archive, F and CR drawn around remembered successes. Phase two is the covariance matrix
-adaptation evolution strategy with the default constants of the tutorial [hansen2016], started at the best point with
-the shape of the last population. The first finds the right valley among many, the second follows it to rounding.
+adaptation evolution strategy [hansen2016], started at the best point with the shape of the last population. The first
+finds the right valley among many, the second follows it to rounding.
 
 The size of the population is a schedule over the evaluations and thus common to all runs of a batch; the archive has
 one capacity and a count of its own for each run.
 
-CMA-ES, the covariance matrix adaptation evolution strategy, batched over runs [hansen2016].
-
 Equation numbers are those of the tutorial, arXiv 1604.00772, with its default constants but one thing: its negative
-weights of the worse half (active CMA) are left out, so that the weights are positive and sum to 1. Phase two of
-SHADE-CMA.
+weights of the worse half (active CMA) are left out, so that the weights are positive and sum to 1.
 """
 
 from __future__ import annotations
@@ -25,13 +22,16 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.optimization.operators import gather, integers
-from accelcal_cli.optimization.optimizer import CONVERGED, OPTIMIZERS, RUNNING, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
 TERMINAL = np.nan
 """Value of M_CR that is never left: CR is 0 from then on, one gene at a time [tanabe2014]."""
+
+SMALLEST_SIGMA = 1e-300
+"""Step size below which phase two has converged: close to the smallest double."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +46,24 @@ class ShadeState(State):
     used: int  # evaluations so far
 
 
+@dataclass(frozen=True, eq=False)
+class CmaState(State):
+    """Phase two: a search distribution for each run; x and fx are its last samples."""
+
+    mean: Float  # (R, D)
+    sigma: Float  # (R,)
+    C: Float  # (R, D, D)
+    axes: Float  # B, eigenvectors of C, (R, D, D)
+    lengths: Float  # square roots of its eigenvalues, (R, D)
+    path_sigma: Float  # (R, D)
+    path_c: Float  # (R, D)
+    generation: int
+    used: int  # evaluations so far
+
+
 @OPTIMIZERS.register("shade-cma")
 @dataclass(frozen=True)
-class ShadeCma(Optimizer):
+class ShadeCma(Optimizer[ShadeState | CmaState]):
     """L-SHADE followed by CMA-ES on one budget of evaluations."""
 
     family = "evolution"
@@ -68,7 +83,7 @@ class ShadeCma(Optimizer):
     archive: float = setting(1.4, "archive size, part of the population", low=0, high=10)
 
     @property
-    def crowd(self) -> int:
+    def points_per_run(self) -> int:
         """A quarter of the starting population: it shrinks fast, and phase two lives on many runs at once."""
         return max(1, self.population // 4)
 
@@ -80,13 +95,13 @@ class ShadeCma(Optimizer):
         zeros = np.zeros(runs, dtype=np.intp)
         return ShadeState(x, problem.cost(x), half, half, zeros, store, zeros, used=population)
 
-    def step(self, problem: Problem, state: ShadeState | CmaState, rng: Streams) -> State:
+    def step(self, problem: Problem, state: ShadeState | CmaState, rng: Streams) -> ShadeState | CmaState:
         """Make one generation of the phase that the evaluations are in."""
         if isinstance(state, CmaState):
-            return step(problem, state, rng, self.evaluations)
+            return _cma_step(problem, state, rng, self.evaluations)
         if state.used + state.x.shape[1] > self.phase_one * self.evaluations:
-            first = start(state.x, state.fx, self.smallest, state.used)
-            return step(problem, first, rng, self.evaluations)
+            first = _cma_start(state.x, state.fx, self.smallest, state.used)
+            return _cma_step(problem, first, rng, self.evaluations)
         return self._generation(problem, state, rng)
 
     def _generation(self, problem: Problem, state: ShadeState, rng: Streams) -> ShadeState:
@@ -200,11 +215,8 @@ def _lehmer(w: Float, values: Float) -> Float:
     return mean
 
 
-SMALLEST_SIGMA = 1e-300
-
-
 @dataclass(frozen=True)
-class Constants:
+class _Constants:
     """Default strategy parameters for lambda samples in D dimensions, tutorial table 1."""
 
     weights: Float  # (mu,)
@@ -218,7 +230,7 @@ class Constants:
 
     @classmethod
     @cache
-    def of(cls, samples: int, D: int) -> Constants:
+    def of(cls, samples: int, D: int) -> _Constants:
         """Return the default constants."""
         raw = math.log((samples + 1) / 2) - np.log(np.arange(1, samples // 2 + 1))
         w = raw / raw.sum()
@@ -237,22 +249,7 @@ class Constants:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class CmaState(State):
-    """A search distribution for each run; x and fx are its last samples."""
-
-    mean: Float  # (R, D)
-    sigma: Float  # (R,)
-    C: Float  # (R, D, D)
-    axes: Float  # B, eigenvectors of C, (R, D, D)
-    lengths: Float  # square roots of its eigenvalues, (R, D)
-    path_sigma: Float  # (R, D)
-    path_c: Float  # (R, D)
-    generation: int
-    used: int  # evaluations so far
-
-
-def start(x: Float, fx: Float, samples: int, used: int) -> CmaState:
+def _cma_start(x: Float, fx: Float, samples: int, used: int) -> CmaState:
     """Return the search distribution of a population x, shape (R, P, D): its best point, half its covariance.
 
     The covariance is normalised to unit mean variance and mixed half and half with the identity; sigma is the square
@@ -282,10 +279,10 @@ def start(x: Float, fx: Float, samples: int, used: int) -> CmaState:
     )
 
 
-def step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaState:
+def _cma_step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaState:
     """Sample, rank, and adapt mean, paths, covariance and step size."""
     samples, D = state.x.shape[1:]
-    k = Constants.of(samples, D)
+    k = _Constants.of(samples, D)
     x, y = _sample(problem, state, rng)
     fx = problem.cost(x)
     rows, order = np.arange(len(fx))[:, None], np.argsort(fx, axis=1, kind="stable")
@@ -304,7 +301,7 @@ def step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> CmaSta
     lengths = np.sqrt(np.maximum(values, 0.0))
     used = state.used + samples
     done = (sigma * lengths[:, -1] < SMALLEST_SIGMA) | (ranked[:, 0] == 0) | (used + samples > budget)
-    status = np.where(done, CONVERGED, RUNNING).astype(np.int8)
+    status = np.where(done, Status.CONVERGED, Status.RUNNING).astype(np.int8)
     return CmaState(
         x, fx, mean, sigma, C, axes, lengths, path_sigma, path_c, state.generation + 1, used, status=status
     )
@@ -315,9 +312,9 @@ def _sample(problem: Problem, state: CmaState, rng: Streams) -> tuple[Float, Flo
     z = rng.normal(*state.x.shape[1:])
     y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
     mean, sigma = state.mean[:, None], state.sigma[:, None, None]
-    drawn = mean + sigma * y  # eq. 40
-    x = np.clip(drawn, *problem.limits)
-    pressed = x != drawn
+    sample = mean + sigma * y  # eq. 40
+    x = np.clip(sample, *problem.limits)
+    pressed = x != sample
     if pressed.any():
         # The other steps stay as drawn, not as rounded: rounded to the spacing of doubles around the mean they shrink
         # to nothing, and sigma with them, one step of that spacing before the minimum.
@@ -325,7 +322,7 @@ def _sample(problem: Problem, state: CmaState, rng: Streams) -> tuple[Float, Flo
     return x, y
 
 
-def _step_size(problem: Problem, sigma: Float, length: Float, ranked: Float, k: Constants) -> Float:
+def _step_size(problem: Problem, sigma: Float, length: Float, ranked: Float, k: _Constants) -> Float:
     """Return the new sigma, eq. 44, from the length of its path and the costs in order, at most the box."""
     sigma = sigma * np.exp(k.c_sigma / k.d_sigma * (length / k.chi - 1))
     # The best 70 % of samples cost the same: no direction to go, so the step has to grow.
@@ -342,7 +339,7 @@ def _whiten(state: CmaState, y: Float) -> Float:
     return white
 
 
-def _adapt(C: Float, path: Float, chosen: Float, short: Float, k: Constants) -> Float:
+def _adapt(C: Float, path: Float, chosen: Float, short: Float, k: _Constants) -> Float:
     """Return the new covariance, eq. 47: rank-one update by the path, rank-mu update by the best samples."""
     lost = (1 - short) * k.c_c * (2 - k.c_c)
     kept = 1 - k.c_1 - k.c_mu + k.c_1 * lost[..., None]

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimization.algorithms.de import DifferentialEvolution, mutates
-from accelcal_cli.optimization.operators import gather, integers, partners
+from accelcal_cli.optimization.algorithms.de import DifferentialEvolution
+from accelcal_cli.optimization.operators import gather, integers, mutated_genes, partners
 from accelcal_cli.rng import Streams
 
 
@@ -61,14 +61,15 @@ def test_the_share_of_parental_genes(share):
     """P_c of all genes stay the parent's, but the forced one: P_c (1 - 1/D) of all."""
     dimensions, points = 12, 20_000
     u = Streams(4, [0]).uniform(points, dimensions + 1)[:, None]
-    taken = mutates(u[..., :dimensions], share, integers(u[..., dimensions:], dimensions)[..., 0, :])[0, 0]
-    assert np.isin(taken, (0.0, 1.0)).all()
+    gene = integers(u[..., dimensions:], dimensions)[..., 0, :]
+    mutated = mutated_genes(u[..., :dimensions], share, gene)[0, 0]
+    assert np.isin(mutated, (0.0, 1.0)).all()
     expected = share * (1 - 1 / dimensions)
-    assert 1 - taken.mean() == pytest.approx(expected, abs=0.005)
-    assert taken.any(axis=1).all(), "a trial without one gene of the mutant"
+    assert 1 - mutated.mean() == pytest.approx(expected, abs=0.005)
+    assert mutated.any(axis=1).all(), "a trial without one gene of the mutant"
     if share == 1.0:
-        assert taken.sum() == points
-        assert taken.sum(axis=0) == pytest.approx(np.full(dimensions, points / dimensions), rel=0.1)
+        assert mutated.sum() == points
+        assert mutated.sum(axis=0) == pytest.approx(np.full(dimensions, points / dimensions), rel=0.1)
 
 
 def test_gather_takes_rows():

@@ -1,4 +1,4 @@
-"""Counting evaluations, remembering the best point, and tables."""
+"""Counting evaluations and remembering the best point."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 from known_problems import Decay, ShiftedSphere
 
 from accelcal_cli.optimization.problem import Counted, Problem
-from accelcal_cli.table import Column, Table
 
 
 def _points(problem, runs, population, seed=0):
@@ -111,27 +110,6 @@ def test_a_wrapped_problem_shows_units_and_groups():
     assert Counted(Scaled(), 1).groups.tolist() == [0, 0, 1, 1]
     assert ShiftedSphere().units.tolist() == [1.0] * 4
     assert ShiftedSphere().groups.tolist() == [0] * 4
-
-
-@pytest.mark.parametrize(
-    ("value", "spec", "text"),
-    [
-        (1.23456, ".2f", "1.23"),
-        (None, ".2f", "-"),
-        (float("nan"), ".2f", "-"),
-        ("word", ".2f", "word"),
-        (7, "", "7"),
-    ],
-)
-def test_cells(value, spec, text):
-    assert Column("a", format=spec).text(value) == text
-
-
-def test_records_are_keyed_by_the_columns():
-    table = Table("t", (Column("a"), Column("b", key="b_2")), ((1, 2), (3, 4)))
-    assert table.records() == [{"a": 1, "b_2": 2}, {"a": 3, "b_2": 4}]
-    with pytest.raises(ValueError):
-        Table("t", (Column("a"),), ((1, 2),)).records()
 
 
 @pytest.mark.parametrize("make", [ShiftedSphere, Decay])

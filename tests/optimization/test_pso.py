@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimization.algorithms.pso import ParticleSwarm, pairs, velocity
+from accelcal_cli.optimization.algorithms.pso import ParticleSwarm, velocity
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.optimization.operators import better_of
 from accelcal_cli.rng import Streams
@@ -24,19 +24,20 @@ def test_velocity_is_equation_1(seed, w, c1, c2):
     rng = Streams(seed, range(runs))
     x, v, memory = (rng.normal(population, dimensions) for _ in range(3))
     leader = rng.normal(1, dimensions)[:, 0]
-    r = pairs(rng.uniform(population, 2 * dimensions)[:, None])[:, 0]
-    before = [a.copy() for a in (x, v, memory, leader, r)]
-    got = velocity(x, v, memory, leader, r, w, c1, c2)
+    r1, r2 = rng.uniform(population, dimensions), rng.uniform(population, dimensions)
+    arguments = (x, v, memory, leader, r1, r2)
+    before = [a.copy() for a in arguments]
+    got = velocity(*arguments, w, c1, c2)
     for run in range(runs):
         for i in range(population):
             for d in range(dimensions):
                 expected = (
                     w * v[run, i, d]
-                    + c1 * r[run, 0, i, d] * (leader[run, d] - x[run, i, d])
-                    + c2 * r[run, 1, i, d] * (memory[run, i, d] - x[run, i, d])
+                    + c1 * r1[run, i, d] * (leader[run, d] - x[run, i, d])
+                    + c2 * r2[run, i, d] * (memory[run, i, d] - x[run, i, d])
                 )
                 assert got[run, i, d] == pytest.approx(expected, rel=1e-12, abs=1e-12)
-    for old, new in zip(before, (x, v, memory, leader, r), strict=True):
+    for old, new in zip(before, arguments, strict=True):
         np.testing.assert_array_equal(old, new)
 
 

@@ -52,6 +52,48 @@ def test_take_goes_on_where_the_runs_stand():
     assert part.uniform(4, 2).tobytes() == whole.uniform(4, 2)[[1, 4]].tobytes()
 
 
+def _halves(u):
+    """Two arrays of shape (R, K, ...): the first column doubled, and all."""
+    return 2.0 * u[..., 0], u
+
+
+def _sizes(u):
+    return (np.broadcast_to(u.shape[1], u.shape[:2]),)
+
+
+@pytest.mark.parametrize("runs", [1, 3, 20])
+@given(st.lists(st.sampled_from(["ahead", "other", "uniform", "normal", "take"]), max_size=12))
+def test_drawing_ahead_gives_the_numbers_of_single_draws(runs, order):
+    """Whatever is drawn before, between and after."""
+    ahead, single, left = Streams(5, range(runs)), Streams(5, range(runs)), np.arange(runs)
+    for kind in ["ahead", "ahead", *order, "ahead"]:
+        if kind in ("ahead", "other"):
+            columns = 3 if kind == "ahead" else 2
+            doubled, numbers = ahead.ahead(_halves, 100, columns)
+            expected = single.uniform(100, columns)
+            np.testing.assert_array_equal(doubled, 2.0 * expected[..., 0])
+        elif kind == "take":
+            kept = np.arange(0, len(left), 2)
+            ahead, single, left = ahead.take(kept), single.take(kept), left[kept]
+            continue
+        else:
+            numbers, expected = getattr(ahead, kind)(100, 3), getattr(single, kind)(100, 3)
+        np.testing.assert_array_equal(numbers, expected)
+        assert numbers.shape == expected.shape
+
+
+def test_a_small_batch_draws_several_iterations_ahead_and_a_large_one_does_not():
+    sizes = [int(Streams(0, range(runs)).ahead(_sizes, 100, 24)[0][0]) for runs in (1, 3, 20)]
+    assert sizes[0] > sizes[1] > sizes[2] == 1
+
+
+def test_what_a_part_draws_ahead_is_not_drawn_again():
+    streams = Streams(0, range(3))
+    streams.ahead(_halves, 4, 3)
+    part = streams.take(np.array([1]))
+    assert (part.ahead(_halves, 4, 3)[1][0] != streams.uniform(4, 3)[1]).all()
+
+
 def test_shapes_and_statistics():
     rng = Streams(1, range(3))
     u, z = rng.uniform(20_000, 2), rng.normal(20_000, 2)

@@ -10,7 +10,8 @@ from simulated import DPSO, MEMS, dpso_box, loetters, noise
 
 from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
-from accelcal_cli.optimization.minimize import Status, minimize
+from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.sensor import poses
 
 G = 9.8

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
-import contract
+import optimizer_contract as contract
 import pytest
 
-from accelcal_cli.config import load_mapping, shipped
+from accelcal_cli.config import load_mapping
 from accelcal_cli.optimization.minimize import minimize
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, State, optimizer_file
 
 NAMES = OPTIMIZERS.names()
 PAIRS = [(name, case) for name in NAMES for case in contract.cases(OPTIMIZERS.get(name))]
@@ -119,7 +121,7 @@ def test_the_contract_sees_runs_that_share_their_random_numbers(monkeypatch):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_optimizer_ships_its_settings(name):
     """One YAML file an algorithm: it names its source and states every setting there is."""
-    record = load_mapping(shipped("optimizers")[name])
+    record = load_mapping(optimizer_file(name))
     cls = OPTIMIZERS.get(name)
     assert record["optimizer"] == name
     assert record["source"]
@@ -140,6 +142,17 @@ def test_every_optimizer_says_what_it_is(name):
     assert cls.__doc__
     for field in dataclasses.fields(cls):
         assert field.metadata["doc"], f"{name}: {field.name} has no description"
+
+
+def _run_13(name):
+    cls = OPTIMIZERS.get(name)
+    return minimize(contract.CASES[contract.cases(cls)[0]].make(), contract.short(cls), runs=[13], seed=9)
+
+
+def test_another_worker_gives_the_same_bits():
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        for name, elsewhere in zip(NAMES, pool.map(_run_13, NAMES), strict=True):
+            contract.same_run(elsewhere, 0, _run_13(name), 0)
 
 
 def test_a_problem_that_lacks_what_an_optimizer_needs_does_not_suit():

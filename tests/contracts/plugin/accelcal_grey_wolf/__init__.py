@@ -1,0 +1,1 @@
+"""The grey wolf optimizer for accelcal."""
