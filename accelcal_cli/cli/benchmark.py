@@ -119,12 +119,12 @@ def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
         from accelcal_cli.output.console import show
         from accelcal_cli.studies.benchmark import rank
         from accelcal_cli.studies.study import median_curves
-        from accelcal_cli.views.blocks import benchmark
-        from accelcal_cli.views.studies import benchmark_title, ranking_table
+        from accelcal_cli.views.studies import benchmark_blocks, benchmark_title, ranking_table
 
         ranking = rank(study, records)
         further = [ranking_table(ranking)] if ranking else []
-        show(benchmark(benchmark_title(study), rows, median_curves(study, records), study.tolerance, further))
+        curves = median_curves(study, records)
+        show(benchmark_blocks(benchmark_title(study), rows, curves, study.tolerance, further))
     sys.stdout.flush()
 
 

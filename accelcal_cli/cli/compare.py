@@ -201,13 +201,13 @@ def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
     if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show
         from accelcal_cli.studies.study import median_curves
-        from accelcal_cli.views import blocks
         from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
+        from accelcal_cli.views.studies import study_blocks
 
         panels = median_curves(study, records)
         plotted = {"Convergence": panels[""]} if panels[""] else {}
         title, note = comparison_subject(study), comparison_conditions(study)
-        show(blocks.study(title, [replace(rows.filled(), title="")], plotted, note))
+        show(study_blocks(title, [replace(rows.filled(), title="")], plotted, note))
     sys.stdout.flush()
 
 

@@ -65,14 +65,14 @@ def _experiment(
     """Run an experiment on optimizers and print it beside the paper's numbers."""
     from accelcal_cli.output.console import show
     from accelcal_cli.studies.reproduce import curves
-    from accelcal_cli.views import blocks
     from accelcal_cli.views.experiments import experiment_tables
+    from accelcal_cli.views.studies import study_blocks
 
     records = study_options.run(experiment)
     results = experiment_tables(experiment, records)
     if format == "table":
         plotted = curves(experiment, records, shown=True)
-        show(blocks.study(experiment.title, results, plotted, experiment.note))
+        show(study_blocks(experiment.title, results, plotted, experiment.note))
     else:
         _print(experiment.name, experiment.title, results, format)
     sys.stdout.flush()

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from accelcal_cli.studies.benchmark import LEVEL, Benchmark, Ranking, statistics
 from accelcal_cli.studies.study import Record, Row, Study
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import BLANK, Block, Curves, Paragraph, convergence
 
 FEW = 5
 """Below this many functions the chi-squared distribution is a coarse approximation and the power is small."""
@@ -14,7 +15,7 @@ FEW = 5
 
 def table_of(title: str, columns: Sequence[Column], rows: Iterable[Row], notes: Iterable[str] = ()) -> Table:
     """Return a table of rows of statistics, each cell found by the key of its column."""
-    keys = [column.key or column.name for column in columns]
+    keys = [column.label for column in columns]
     return Table(title, tuple(columns), tuple([row[key] for key in keys] for row in rows), tuple(notes))
 
 
@@ -102,3 +103,50 @@ def _ranking_notes(ranking: Ranking) -> tuple[str, ...]:
             f"{ranking.functions} functions are few: with so few the tests detect only large differences."
         )
     return tuple(notes)
+
+
+def study_blocks(title: str, tables: Iterable[Table], curves: Curves, note: str = "") -> list[Block]:
+    """Return what a study shows.
+
+    Args:
+        title: what was run; note: what to know when reading it.
+        tables: its tables, each with its title and notes.
+        curves: evaluations and median cost, by what they belong to and optimizer.
+    """
+    remark: list[Block] = [Paragraph(note.strip())] if note else []
+    plots = [convergence(name, panel) for name, panel in curves.items()]
+    return [Paragraph(heading=title), *remark, BLANK, *tables, *plots]
+
+
+BELOW = 1e-4
+"""Part of the tolerance where the plots of a benchmark have their floor."""
+
+
+def benchmark_blocks(
+    title: str, summary: Table, curves: Curves, tolerance: float, further: Iterable[Table]
+) -> list[Block]:
+    """Return what a benchmark shows: table and curves of each function, then tables of all.
+
+    Args:
+        title: what was run.
+        summary: its first column is the function.
+        curves: evaluations and median cost by function and optimizer.
+        tolerance: costs far below it are not told apart in the plots.
+        further: tables that follow, such as ranks.
+    """
+    blocks: list[Block] = [Paragraph(heading=title), BLANK]
+    for function, panel in curves.items():
+        blocks.append(_of_function(summary, function))
+        if panel:
+            blocks.append(convergence(function, panel, tolerance * BELOW))
+    return [*blocks, *further]
+
+
+def _of_function(summary: Table, function: str) -> Table:
+    """Return the rows of one function, without what the heading says, nor failures where there are none."""
+    keys = [column.label for column in summary.columns]
+    rows = tuple(row for row in summary.rows if row[0] == function)
+    failed = any(row[keys.index("failures")] for row in rows)
+    hidden = ("function", "runs") if failed else ("function", "runs", "failures")
+    table = Table(function, summary.columns, rows)
+    return table.with_columns(i for i, key in enumerate(keys) if key not in hidden)
