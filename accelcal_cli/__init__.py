@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.calibrate import calibrate as calibrate
     from accelcal_cli.calibration.result import Calibration as Calibration
     from accelcal_cli.calibration.settings import Settings as Settings
-    from accelcal_cli.config import load_sensor as load_sensor
-    from accelcal_cli.config import load_settings as load_settings
+    from accelcal_cli.calibration.settings import load_settings as load_settings
     from accelcal_cli.errors import AccelcalError as AccelcalError
     from accelcal_cli.io.readings import Readings as Readings
     from accelcal_cli.io.readings import read_readings as read_readings
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from accelcal_cli.optimization.optimizer import OPTIMIZERS as OPTIMIZERS
     from accelcal_cli.optimization.problem import Problem as Problem
     from accelcal_cli.sensor.model import ErrorModel as ErrorModel
+    from accelcal_cli.sensor.simulation import load_sensor as load_sensor
 
 __version__ = "0.1.0"
 
@@ -38,8 +38,8 @@ _HOMES = {
     "Readings": "io.readings",
     "Settings": "calibration.settings",
     "calibrate": "calibration.calibrate",
-    "load_sensor": "config",
-    "load_settings": "config",
+    "load_sensor": "sensor.simulation",
+    "load_settings": "calibration.settings",
     "minimize": "optimization.minimize",
     "read_readings": "io.readings",
 }

@@ -106,8 +106,8 @@ class Registry(Generic[T]):
         return self._classes.get(name)
 
     def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
-        """Build the class called `name` from `mapping`; see `schema.build`."""
-        return schema.build(self.get(name), mapping, where)
+        """Build the class called `name` from `mapping`; see `schema.from_mapping`."""
+        return schema.from_mapping(self.get(name), mapping, where)
 
     def beside(self, name: str, suffix: str) -> Path | None:
         """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""

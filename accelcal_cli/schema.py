@@ -1,17 +1,76 @@
-"""One schema for settings and records: mappings to frozen dataclasses, strictly."""
+"""One schema for settings and for records: frozen dataclasses to plain mappings and back, each value checked.
+
+A field says once what it may be: its type, and by `setting` or by `Annotated[type, Limits(...)]` its range, its shape
+and what None stands for. `to_mapping` and `from_mapping` do the rest. Settings, which people write, and records, which
+programs write, differ in two ways alone: every setting has a default, and unknown keys of a record are passed over,
+since a later version may have written them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+import numpy as np
+
 from accelcal_cli.errors import ConfigError, did_you_mean
 
 T = TypeVar("T")
+
+KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)e[-+]?\d+", re.IGNORECASE)
+"""A number that YAML 1.1 takes for text: 1e-6 has no dot, 1.5e6 no sign."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What a field may hold, besides its type.
+
+    Attributes:
+        low, high: inclusive; above: exclusive; of the number, or of each number in a list, mapping or array.
+        none: the number that None stands for in a file, NaN or infinity; without it None is refused.
+        shape: of an array.
+        older: the value for a file that was written before there was such a field; `...`: none.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    none: float | None = None
+    shape: tuple[int, ...] = ()
+    older: Any = ...
+
+    @classmethod
+    def stated(cls, metadata: Mapping[str, Any]) -> Limits:
+        """Return the range in the metadata of a `setting`."""
+        return cls(metadata.get("low"), metadata.get("high"), metadata.get("above"))
+
+    def check(self, value: Any, label: str) -> None:
+        """Raise ConfigError when a number, or one in a tuple, is not finite or outside the range; `label` is named."""
+        if isinstance(value, tuple):
+            for i, element in enumerate(value):
+                self.check(element, f"{label}[{i}]")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{label}: {value} is not a finite number")
+        if self.low is not None and value < self.low:
+            raise ConfigError(f"{label}: {_short(value)} is too small; expected at least {self.low:g}")
+        if self.above is not None and value <= self.above:
+            raise ConfigError(f"{label}: {_short(value)} is too small; expected more than {self.above:g}")
+        if self.high is not None and value > self.high:
+            raise ConfigError(f"{label}: {_short(value)} is too large; expected at most {self.high:g}")
+
+
+def array(*shape: int, none: float | None = None, largest: float | None = None) -> Limits:
+    """Return the limits of an array of a shape; without `none` no number may be missing."""
+    return Limits(shape=shape, none=none, high=largest, low=None if largest is None else -largest)
 
 
 def setting(
@@ -24,118 +83,187 @@ def setting(
     return dataclasses.field(default=default, metadata={"doc": doc, "low": low, "high": high, "above": above})
 
 
-def check(instance: Any, where: str = "") -> None:
-    """Raise ConfigError when a field of a dataclass made with `setting` is outside its range."""
-    for field in dataclasses.fields(instance):
-        value, limits = getattr(instance, field.name), field.metadata
-        if isinstance(value, tuple) and not _all_finite(value):
-            raise ConfigError(f"{where}{field.name}: {list(value)} holds a number that is not finite")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            continue
-        label = f"{where}{field.name}"
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{label}: {value} is not a finite number")
-        if limits.get("low") is not None and value < limits["low"]:
-            raise ConfigError(f"{label}: {value} is too small; expected at least {limits['low']:g}")
-        if limits.get("above") is not None and value <= limits["above"]:
-            raise ConfigError(f"{label}: {value} is too small; expected more than {limits['above']:g}")
-        if limits.get("high") is not None and value > limits["high"]:
-            raise ConfigError(f"{label}: {_shown(value)} is too large; expected at most {limits['high']:g}")
+def check(instance: Any) -> None:
+    """Raise ConfigError when a number in a field of a dataclass is outside the field's range, or not finite."""
+    for name, (_, limits) in _declared(type(instance)).items():
+        limits.check(getattr(instance, name), name)
 
 
-def _shown(value: float) -> str:
-    text = str(value)
+def _short(value: Any) -> str:
+    """Return a value as a message shows it: a number of 400 digits is cut off."""
+    text = repr(value)
     return text if len(text) <= 30 else f"{text[:30]}..."
 
 
-def _all_finite(values: tuple[Any, ...]) -> bool:
-    return all(_all_finite(v) if isinstance(v, tuple) else math.isfinite(v) for v in values)
+def to_mapping(record: Any) -> dict[str, Any]:
+    """Return a dataclass as plain mappings, lists, numbers, text and None, ready for JSON and YAML.
+
+    Mappings, arrays, sequences and dataclasses in it are taken apart likewise, and so is a mapping instead of a
+    dataclass; NaN and infinity become None, since JSON has neither.
+    """
+    mapping: dict[str, Any] = _plain(record)
+    return mapping
 
 
-def build(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
-    """Build dataclass `cls` from `mapping`, refusing unknown keys and wrong types.
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, float):  # a float64 of numpy is one, too, which YAML does not know
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if dataclasses.is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    return value
+
+
+def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str, *, extra: bool = False) -> T:
+    """Return dataclass `cls` of a mapping whose keys are its fields; a key may be left out if the field has a default.
 
     Args:
-        cls: a frozen dataclass whose fields are the permitted keys.
-        mapping: what a YAML file or a command line gave.
+        cls: a frozen dataclass.
+        mapping: what a YAML or JSON file or a command line gave.
         where: what to name in a message, for instance ``de-pso.yaml: parameters``.
+        extra: whether keys that are not known are passed over rather than refused, here and in the parts.
 
     Raises:
-        ConfigError: an unknown key (with the nearest known one), a wrong type, or a value out of range.
+        ConfigError: an unknown key (with the nearest known one), a missing one, a wrong type or shape, or a value out
+            of range; the message says where and what was expected.
     """
-    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(cls)
-    values = {}
+    fields = _declared(cls)
+    values = {name: limits.older for name, (_, limits) in fields.items() if limits.older is not ...}
     for key, value in mapping.items():
-        if key not in fields:
+        if key in fields:
+            values[key] = _convert(value, *fields[key], f"{where}: {key}", extra)
+        elif not extra:
             known = ", ".join(fields) or "none"
             raise ConfigError(f'{where}: unknown key "{key}"{did_you_mean(str(key), fields)}; known: {known}')
-        values[key] = convert(value, hints[key], f"{where}: {key}")
+    missing = [name for name in _required(cls) if name not in values]
+    if missing:
+        raise ConfigError(f"{where}: missing: {', '.join(missing)}")
     try:
         return cls(**values)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
 
 
-def convert(value: Any, hint: Any, label: str) -> Any:
+_DECLARED: dict[type, dict[str, tuple[Any, Limits]]] = {}
+
+
+def _declared(cls: type) -> dict[str, tuple[Any, Limits]]:
+    """Return type and limits of the fields of a dataclass by name; looked up once for each class."""
+    if cls not in _DECLARED:
+        hints = typing.get_type_hints(cls, include_extras=True)
+        _DECLARED[cls] = {
+            field.name: _apart(hints[field.name], Limits.stated(field.metadata))
+            for field in dataclasses.fields(cls)
+        }
+    return _DECLARED[cls]
+
+
+def _apart(hint: Any, limits: Limits) -> tuple[Any, Limits]:
+    """Return type and limits of `Annotated[type, Limits(...)]`; any other type with the limits that are given."""
+    return typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint, limits)
+
+
+def _required(cls: Any) -> list[str]:
+    """Return the names of the fields without a default."""
+    none = (dataclasses.MISSING, dataclasses.MISSING)
+    return [f.name for f in dataclasses.fields(cls) if (f.default, f.default_factory) == none]
+
+
+def _convert(value: Any, hint: Any, limits: Limits, label: str, extra: bool) -> Any:
     """Return `value` as the annotated type, or raise ConfigError saying what was expected.
 
     Whole floats such as 1e3 pass for integers, and integers for floats; nothing else is bent.
     """
-    if hint is Any:
-        return value
+    hint, limits = _apart(hint, limits)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
+        if value is None:
             return None
         (hint,) = [argument for argument in arguments if argument is not type(None)]
-        return convert(value, hint, label)
-    if origin is typing.Literal:
-        if value not in arguments or isinstance(value, bool):
-            raise ConfigError(
-                f"{label}: {value!r} is not one of {', '.join(map(str, arguments))}"
-                f"{did_you_mean(str(value), map(str, arguments))}"
-            )
-        return value
-    if origin is dict and isinstance(value, Mapping):
-        return dict(value)
-    if origin is tuple:
-        return _sequence(value, arguments, label)
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return _convert(value, hint, limits, label, extra)
+    if origin is np.ndarray:
+        return _array(value, limits, label)
+    if origin is dict or dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
-            raise ConfigError(f"{label}: expected a mapping of keys, not {value!r}")
-        return build(hint, value, label)
-    return _scalar(value, hint, label)
+            raise ConfigError(f"{label}: expected a mapping of keys, not {_short(value)}")
+        if origin is not dict:
+            return from_mapping(hint, value, label, extra=extra)
+        return {key: _convert(v, arguments[1], limits, f"{label}: {key}", extra) for key, v in value.items()}
+    if origin is tuple:
+        return _sequence(value, arguments, limits, label, extra)
+    if origin is typing.Literal:
+        return _choice(value, arguments, label)
+    return _free(value, label) if hint is Any else _scalar(value, hint, limits, label)
 
 
-def _scalar(value: Any, hint: Any, label: str) -> Any:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int and number and (isinstance(value, int) or value.is_integer()):
-        return int(value)
-    if hint is float and number:
-        try:
-            return float(value)
-        except OverflowError:
-            raise ConfigError(f"{label}: {_shown(value)} is too large; no number can be") from None
-    if hint is float and isinstance(value, str):
-        # YAML 1.1 reads 1e-6 (no dot) as text; the number is meant.
-        try:
-            return float(value)
-        except ValueError:
-            pass
-    if hint in (bool, str) and isinstance(value, hint):
-        return value
-    names = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-    raise ConfigError(f"{label}: expected {names.get(hint, str(hint))}, not {value!r}")
+def _array(value: Any, limits: Limits, label: str) -> Any:
+    rows: Any = float
+    for length in reversed(limits.shape):
+        rows = types.GenericAlias(tuple, (rows,) * length)
+    try:
+        return np.array(_convert(value, rows, limits, label.rpartition(": ")[2], extra=False))
+    except ConfigError as error:
+        numbers = " x ".join(map(str, limits.shape))
+        raise ConfigError(f"{label}: expected {numbers} numbers; {error}") from None
 
 
-def _sequence(value: Any, arguments: tuple[Any, ...], label: str) -> tuple[Any, ...]:
+def _sequence(
+    value: Any, arguments: tuple[Any, ...], limits: Limits, label: str, extra: bool
+) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
-        raise ConfigError(f"{label}: expected a list, not {value!r}")
+        raise ConfigError(f"{label}: expected a list, not {_short(value)}")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
         arguments = (arguments[0],) * len(value)
     if len(value) != len(arguments):
         raise ConfigError(f"{label}: expected {len(arguments)} values, not {len(value)}")
-    return tuple(
-        convert(v, a, f"{label}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True))
-    )
+    pairs = enumerate(zip(value, arguments, strict=True))
+    return tuple(_convert(v, hint, limits, f"{label}[{i}]", extra) for i, (v, hint) in pairs)
+
+
+def _choice(value: Any, choices: tuple[Any, ...], label: str) -> Any:
+    if value not in choices or isinstance(value, bool):
+        names = [str(choice) for choice in choices]
+        near = did_you_mean(str(value), names)
+        raise ConfigError(f"{label}: {_short(value)} is not one of {', '.join(names)}{near}")
+    return value
+
+
+def _scalar(value: Any, hint: Any, limits: Limits, label: str) -> Any:
+    if value is None and limits.none is not None:
+        return limits.none
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if (hint is float and isinstance(value, str) and EXPONENT.fullmatch(value)) or (hint is float and number):
+        value = _float(value, label)
+    elif hint is int and number and (isinstance(value, int) or value.is_integer()):
+        value = int(value)
+    elif hint not in (bool, str) or not isinstance(value, hint):
+        raise ConfigError(f"{label}: expected {KINDS.get(hint, str(hint))}, not {_short(value)}")
+    limits.check(value, label)
+    return value
+
+
+def _float(value: Any, label: str) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise ConfigError(f"{label}: {_short(value)} is too large for a floating-point number") from None
+
+
+def _free(value: Any, label: str, depth: int = 4) -> Any:
+    """Return a value of any kind, once no whole number in it, down to a depth, is too large for a float."""
+    if isinstance(value, int):
+        _float(value, label)
+    elif depth and isinstance(value, Mapping):
+        for key, part in value.items():
+            _free(part, f"{label}: {key}", depth - 1)
+    elif depth and isinstance(value, list):
+        for i, part in enumerate(value):
+            _free(part, f"{label}[{i}]", depth - 1)
+    return value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,11 +25,14 @@ class Column:
     key: str = ""
     beside: bool = False
 
+    @property
+    def label(self) -> str:
+        """Name of the column in machine-readable output."""
+        return self.key or self.name
+
     def text(self, value: Any) -> str:
         """Return the cell as a person reads it; a missing value is a dash."""
-        if value is None:
-            return "-"
-        if isinstance(value, float) and value != value:
+        if value is None or value != value:
             return "-"
         return format(value, "" if isinstance(value, str) else self.format)
 
@@ -41,7 +44,7 @@ class Table:
     Attributes:
         title: what the table shows.
         columns: its columns, in order.
-        rows: one sequence of raw values a row, as long as `columns`.
+        rows: one sequence of raw values per row, as long as `columns`.
         notes: plain sentences that belong under the table.
     """
 
@@ -52,11 +55,17 @@ class Table:
 
     def records(self) -> list[Mapping[str, Any]]:
         """Return the rows as mappings from column key to raw value."""
-        keys = [column.key or column.name for column in self.columns]
+        keys = [column.label for column in self.columns]
         return [dict(zip(keys, row, strict=True)) for row in self.rows]
 
     def filled(self) -> Table:
-        """Return the table without the columns that hold nothing in any row."""
-        keep = [i for i in range(len(self.columns)) if any(row[i] not in (None, "") for row in self.rows)]
+        """Return the table without the columns that are empty in every row."""
+        return self.with_columns(
+            i for i in range(len(self.columns)) if any(row[i] not in (None, "") for row in self.rows)
+        )
+
+    def with_columns(self, numbers: Iterable[int]) -> Table:
+        """Return the table with the columns of these numbers, from 0, alone."""
+        keep = list(numbers)
         rows = tuple([row[i] for i in keep] for row in self.rows)
         return replace(self, columns=tuple(self.columns[i] for i in keep), rows=rows)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
-from accelcal_cli.config import load_sensor
 from accelcal_cli.sensor.poses import fibonacci
-from accelcal_cli.sensor.simulation import simulate
+from accelcal_cli.sensor.simulation import load_sensor, simulate
 from benchmarks.clock import pairs, report
 
 G = 9.80665

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from accelcal_cli.config import load_sensor
-from accelcal_cli.sensor.simulation import simulate
+from accelcal_cli.sensor.simulation import load_sensor, simulate
 from benchmarks.clock import pairs, process, report
 
 G = 9.80665

@@ -15,9 +15,8 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid, pack, unpack
-from accelcal_cli.config import load_sensor
 from accelcal_cli.sensor.poses import faces_edges
-from accelcal_cli.sensor.simulation import simulate_fleet
+from accelcal_cli.sensor.simulation import load_sensor, simulate_fleet
 from benchmarks.clock import pairs, process, report
 
 G = 9.80665

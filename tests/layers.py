@@ -10,19 +10,21 @@ from pathlib import Path
 PACKAGE = "accelcal_cli"
 
 GROUPS = (
-    ("errors", "arrays", "rng", "schema", "registry", "table"),
+    ("errors", "arrays", "rng", "schema", "registry", "table", "config"),
     ("optimization", "sensor"),
     ("io",),
     ("calibration",),
     ("detection", "planning", "verification", "exporters"),
-    ("config",),
     ("studies",),
     ("navigation",),
     ("views",),
     ("output",),
     ("cli",),
 )
-"""From the lowest layer to the highest; a module may import from lower groups, and from its own unit."""
+"""From the lowest layer to the highest; a module may import from lower groups, and from its own unit.
+
+`config` knows YAML text, mappings and shipped files alone. It is of the lowest group so that a sensor, settings and a
+calibration load themselves."""
 
 RANK = {unit: rank for rank, group in enumerate(GROUPS) for unit in group}
 

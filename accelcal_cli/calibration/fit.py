@@ -26,7 +26,7 @@ from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution, in_lower, modulus_errors
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.weights import explained, loss_slope, loss_weight
-from accelcal_cli.sensor.model import to_gauge
+from accelcal_cli.sensor.model import Gauge, to_gauge
 
 KEPT = 1000
 """Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""
@@ -108,7 +108,7 @@ class Fit:
     sample: Sample
     settings: Settings
     search: Search
-    gauge: str
+    gauge: Gauge
     K: Float
     D: Float
     lower: Float

@@ -1,23 +1,21 @@
-"""The result of a calibration: one frozen record that carries its units, its uncertainty and its origin.
+"""The record of a calibration: parameters with units, uncertainty, verdict and origin; out to files and back.
 
-The parts of a calibration's record: sigma, dilution of precision, poses.
-
-Plain values to arrays and back, for records that go through JSON and YAML.
-
-From the plain values of a record back to the parts of a calibration, each checked.
+A field of `Calibration` is a key of result files. `schema` writes and checks it by what the field declares, so that a
+new field is one line, its docstring, and `older` for the files that were written before it.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, get_args
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     BIAS,
@@ -28,11 +26,24 @@ from accelcal_cli.calibration.observability import (
     Verdict,
 )
 from accelcal_cli.calibration.settings import LARGEST
-from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.sensor.model import GAUGES, ErrorModel
+from accelcal_cli.config import parse_mapping, read_text
+from accelcal_cli.errors import ConfigError, DataError, UsageError
+from accelcal_cli.schema import Limits, array, from_mapping, to_mapping
+from accelcal_cli.sensor.model import ErrorModel, Gauge
 
 SCHEMA = "accelcal/calibration/1"
 """Name and version of the record; a reader refuses what it does not know."""
+
+MOST = 2**53
+"""Largest count: up to here floats hold every whole number."""
+
+Count = Annotated[int, Limits(high=MOST)]
+MaybeNan = Annotated[float, Limits(none=math.nan)]
+MaybeInfinite = Annotated[float, Limits(none=math.inf)]
+Vector = Annotated[Float, array(3)]
+MaybeVector = Annotated[Float, array(3, none=math.nan)]
+Matrix = Annotated[Float, array(3, 3)]
+"""Numbers and arrays as a result file has them; those that may be missing are null there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,24 +61,11 @@ class Temperature:
     reference: float
     low: float
     high: float
-    scale: Float
-    bias: Float
-    sigma_scale: Float
-    sigma_bias: Float
-    dop: Float
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Temperature:
-        """Return the slopes of a record.
-
-        Raises:
-            KeyError, TypeError, ValueError: a part is missing or of another kind.
-        """
-        reference, low, high = (float(record[key]) for key in ("reference", "low", "high"))
-        scale, bias = (array(record[key], (3,), whole=True) for key in ("scale", "bias"))
-        sigma_scale, sigma_bias = (array(record[key], (3,)) for key in ("sigma_scale", "sigma_bias"))
-        dop = array(record["dop"], (6,))
-        return cls(reference, low, high, scale, bias, sigma_scale, sigma_bias, dop)
+    scale: Vector
+    bias: Vector
+    sigma_scale: MaybeVector
+    sigma_bias: MaybeVector
+    dop: Annotated[Float, array(6, none=math.nan)]
 
     def at_reference(self, output: Float, degrees: Float, D: Float) -> Float:
         """Return readings as they would be at the reference temperature, shape (B, 3).
@@ -79,6 +77,69 @@ class Temperature:
         t = (degrees - self.reference)[:, None]
         brought: Float = (output - D - self.bias * t) / (1.0 + self.scale * t) + D
         return brought
+
+
+@dataclass(frozen=True, eq=False)
+class Sigma:
+    """One-sigma of the parameters; NaN where the poses do not determine them.
+
+    Attributes:
+        K_a: shape (3, 3), output units per m/s^2.
+        D_a: shape (3,), output units.
+    """
+
+    K_a: Annotated[Float, array(3, 3, none=math.nan)]
+    D_a: MaybeVector
+
+
+@dataclass(frozen=True)
+class Dop:
+    """Dilution of precision: the error of a parameter, as m/s^2 at 1 g, over the noise of one pose in m/s^2.
+
+    Attributes:
+        misalignment, scale, bias: the largest of each kind.
+        worst: the largest of all.
+        parameters: each of the nine by its name.
+    """
+
+    misalignment: MaybeInfinite
+    scale: MaybeInfinite
+    bias: MaybeInfinite
+    worst: MaybeInfinite
+    parameters: Annotated[dict[str, float], Limits(none=math.inf)]
+
+    @classmethod
+    def of(cls, dop: Float) -> Dop:
+        """Return the record of the dilution of precision of the nine parameters, shape (9,)."""
+        misalignment, scale, bias = (float(dop[kind].max()) for kind in (MISALIGNMENT, SCALE, BIAS))
+        return cls(
+            misalignment, scale, bias, float(dop.max()), dict(zip(PARAMETERS, dop.tolist(), strict=True))
+        )
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """One pose. Units: m/s^2 (units of g when g = 1).
+
+    Attributes:
+        pose: its number, from 0; where: its line or label in the input.
+        residual: |f| - g; with known attitudes |f| - |reference|.
+        studentised: residual over its standard deviation, by the s of the other poses; with known attitudes by the s
+            of all poses.
+        leverage: part of its own residual that the fit absorbs.
+        left_out: the residual that a fit without the pose would leave.
+        residual_before: |f| - g before calibration.
+        direction: unit vector of the specific force, gauge `lower`.
+    """
+
+    pose: Count
+    where: str
+    residual: MaybeNan
+    studentised: MaybeNan
+    leverage: MaybeNan
+    left_out: MaybeNan
+    residual_before: MaybeNan
+    direction: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,40 +180,40 @@ class Calibration:
         temperature: slopes with temperature, when the readings determine them.
     """
 
-    K_a: Float
-    D_a: Float
-    K_A: Float
-    f_0: Float
-    gauge: str
+    K_a: Annotated[Float, array(3, 3, largest=LARGEST)]
+    D_a: Vector
+    K_A: Matrix
+    f_0: Vector
+    gauge: Gauge
     sigma: Sigma
     dop: Dop
-    verdict: str
+    verdict: Verdict
     reasons: tuple[str, ...]
     suggestions: tuple[str, ...]
-    cautions: tuple[str, ...]
-    cost_search: float
-    cost: float
-    rms: float
-    rms_before: float
+    cautions: Annotated[tuple[str, ...], Limits(older=())]
+    cost_search: MaybeNan
+    cost: MaybeNan
+    rms: MaybeNan
+    rms_before: MaybeNan
     before: str
-    s: float
-    freedom: int
+    s: MaybeNan
+    freedom: Count
     noise_ratio: float | None
     noise_chance: float | None
-    covariance: Float
-    information: Float
-    nominal_scale: Float
-    nominal_bias: Float
-    poses: int
-    evaluations: int
-    runs: int
-    runs_agreeing: int
+    covariance: Annotated[Float, array(9, 9, none=math.nan)]
+    information: Annotated[Float, array(9, 9)]
+    nominal_scale: MaybeVector
+    nominal_bias: MaybeVector
+    poses: Count
+    evaluations: Count
+    runs: Count
+    runs_agreeing: Count
     poses_fit: tuple[PoseFit, ...]
-    outliers: tuple[int, ...]
+    outliers: tuple[Count, ...]
     convergence: tuple[tuple[int, float], ...]
     optimizer: str
     settings: dict[str, Any]
-    g: float
+    g: Annotated[float, Limits(above=0)]
     data: dict[str, Any]
     notes: tuple[str, ...]
     version: str
@@ -170,19 +231,19 @@ class Calibration:
         return "g" if self.g == 1.0 else "m/s^2"
 
     @property
-    def held(self) -> NDArray[np.bool_]:
+    def held(self) -> Bool:
         """Which of the nine parameters were not estimated but taken as zero, shape (9,)."""
         return np.zeros(9, dtype=bool) if self.settings.get("misalignment", True) else ALIGNED
 
     @property
-    def lost(self) -> NDArray[np.bool_]:
+    def lost(self) -> Bool:
         """Which of the nine parameters are not determined, shape (9,).
 
         Definition: in an undetermined result, dilution of precision above 25, or no sigma.
         """
         if self.verdict != "undetermined":
             return np.zeros(9, dtype=bool)
-        poor: NDArray[np.bool_] = np.array(list(self.dop.parameters.values())) > UNDETERMINED
+        poor: Bool = np.array([self.dop.parameters[name] for name in PARAMETERS]) > UNDETERMINED
         return poor | np.isnan(np.diagonal(self.covariance))
 
     def check_determined(self, name: str, *, force: bool = False) -> None:
@@ -199,258 +260,48 @@ class Calibration:
 
     def record(self) -> dict[str, Any]:
         """Return the record as plain mappings, lists, numbers and text; NaN and inf become None."""
-        record: dict[str, Any] = plain(self)
-        return record
+        return to_mapping(self)
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any], where: str) -> Calibration:
         """Return the calibration of a record.
 
         Raises:
-            DataError: not a record of this schema, or a part missing.
+            DataError: not a record of this schema, a part missing or of another kind; `where` is named in the message.
         """
         if record.get("schema") != SCHEMA:
             raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
-        record = {"temperature": None, "cautions": [], **record}
-        missing = [f.name for f in fields(cls) if f.name not in record]
-        if missing:
-            raise DataError(f"{where}: not a whole calibration result; missing: {', '.join(missing)}")
-        return cls(**{f.name: checked(f.name, record[f.name], where) for f in fields(cls)})
+        place = f"{where}: not a calibration result"
+        try:
+            result = from_mapping(cls, record, place, extra=True)
+        except ConfigError as error:
+            raise DataError(str(error)) from None
+        if set(result.dop.parameters) != set(PARAMETERS):
+            raise DataError(f"{place}: dop: parameters: expected {', '.join(PARAMETERS)}")
+        if np.abs(result.K_a).max() < 1 / LARGEST or np.linalg.matrix_rank(result.K_a) < 3:
+            raise DataError(f"{place}: K_a: is singular; expected an invertible matrix")
+        return result
 
 
-@dataclass(frozen=True, eq=False)
-class Sigma:
-    """One-sigma of the parameters; NaN where the poses do not determine them.
-
-    Attributes:
-        K_a: shape (3, 3), output units per m/s^2.
-        D_a: shape (3,), output units.
-    """
-
-    K_a: Float
-    D_a: Float
-
-
-@dataclass(frozen=True)
-class Dop:
-    """Dilution of precision: the error of a parameter, as m/s^2 at 1 g, over the noise of one pose in m/s^2.
-
-    Attributes:
-        misalignment, scale, bias: the largest of each kind.
-        worst: the largest of all.
-        parameters: each of the nine by its name.
-    """
-
-    misalignment: float
-    scale: float
-    bias: float
-    worst: float
-    parameters: dict[str, float]
-
-    @classmethod
-    def of(cls, dop: Float) -> Dop:
-        """Return the record of the dilution of precision of the nine parameters, shape (9,)."""
-        misalignment, scale, bias = (float(dop[kind].max()) for kind in (MISALIGNMENT, SCALE, BIAS))
-        return cls(
-            misalignment, scale, bias, float(dop.max()), dict(zip(PARAMETERS, dop.tolist(), strict=True))
-        )
-
-
-@dataclass(frozen=True)
-class PoseFit:
-    """One pose. Units: m/s^2 (units of g when g = 1).
-
-    Attributes:
-        pose: its number, from 0; where: its line or label in the input.
-        residual: |f| - g; with known attitudes |f| - |reference|.
-        studentised: residual over its standard deviation, by the s of the other poses; with known attitudes by the s
-            of all poses.
-        leverage: part of its own residual that the fit absorbs.
-        left_out: the residual that a fit without the pose would leave.
-        residual_before: |f| - g before calibration.
-        direction: unit vector of the specific force, gauge `lower`.
-    """
-
-    pose: int
-    where: str
-    residual: float
-    studentised: float
-    leverage: float
-    left_out: float
-    residual_before: float
-    direction: tuple[float, float, float]
-
-
-MOST = 2**53
-"""Largest count: up to here floats hold every whole number."""
-
-
-def plain(value: Any) -> Any:
-    """Return a value as plain mappings, lists, numbers and text; NaN and inf become None."""
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, float):  # numpy's too, which YAML does not know
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if hasattr(value, "__dataclass_fields__"):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    return value
-
-
-def array(value: Any, shape: tuple[int, ...], *, whole: bool = False) -> Float:
-    """Return nested lists as an array of a shape, None as NaN.
+def load_result(path: str | Path, stdin: BinaryIO | None = None) -> Calibration:
+    """Return the calibration of a result file, JSON or YAML whatever its name says; of `stdin` where it is given.
 
     Raises:
-        ValueError, TypeError: another shape, no numbers, or None although it is to be `whole`.
+        ConfigError: unreadable, or neither JSON nor YAML.
+        DataError: not the record of a calibration; the message names the key.
     """
-    found = np.array(
-        [
-            [math.nan if v is None else v for v in row]
-            if isinstance(row, list)
-            else (math.nan if row is None else row)
-            for row in value
-        ],
-        dtype=float,
-    )
-    if found.shape != shape:
-        raise ValueError(f"expected {' x '.join(map(str, shape))} numbers")
-    if whole and not np.isfinite(found).all():
-        raise ValueError("a number is missing")
-    return found
-
-
-def of_kind(value: Any, kinds: tuple[type, ...], words: str) -> Any:
-    """Return a value of one of the kinds; a truth value is no number.
-
-    Raises:
-        ValueError: another kind.
-    """
-    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise ValueError(f"{value!r} where {words} was expected")
-    if kinds == (int,) and isinstance(value, int) and abs(value) > MOST:
-        raise ValueError(f"a number beyond {MOST} where {words} was expected")
-    return value
-
-
-def check_size(value: Any, depth: int = 4) -> None:
-    """Refuse a whole number that no float can be, in a value or in lists and mappings `depth` deep.
-
-    Raises:
-        OverflowError: there is one.
-    """
-    if isinstance(value, int):
-        float(value)
-    elif depth and isinstance(value, list | Mapping):
-        for part in value.values() if isinstance(value, Mapping) else value:
-            check_size(part, depth - 1)
-
-
-def or_nan(value: Any) -> float:
-    """Return a number, NaN for None."""
-    return math.nan if value is None else float(value)
-
-
-def or_infinite(value: Any) -> float:
-    """Return a number, infinity for None."""
-    return math.inf if value is None else float(value)
-
-
-SHAPES = {
-    "K_a": (3, 3),
-    "D_a": (3,),
-    "K_A": (3, 3),
-    "f_0": (3,),
-    "covariance": (9, 9),
-    "information": (9, 9),
-    "nominal_scale": (3,),
-    "nominal_bias": (3,),
-}
-WHOLE = ("K_a", "D_a", "K_A", "f_0", "information")
-"""Arrays in which a missing number is a fault of the file."""
-
-SENTENCES = ("reasons", "suggestions", "cautions", "notes")
-
-CHOICES = {"gauge": GAUGES, "verdict": get_args(Verdict)}
-NUMBERS_OR_NAN = ("s", "rms", "rms_before", "cost", "cost_search")
-
-KINDS: dict[str, tuple[tuple[type, ...], str]] = {
-    **dict.fromkeys(("freedom", "poses", "evaluations", "runs", "runs_agreeing"), ((int,), "a whole number")),
-    **dict.fromkeys(
-        ("reasons", "suggestions", "cautions", "notes", "outliers", "poses_fit"), ((list,), "a list")
-    ),
-    **dict.fromkeys(("data", "settings"), ((dict,), "a mapping")),
-    **dict.fromkeys(("before", "optimizer", "version"), ((str,), "text")),
-    **dict.fromkeys(("noise_ratio", "noise_chance"), ((int, float, type(None)), "a number")),
-}
-
-
-def checked(name: str, value: Any, where: str) -> Any:
-    """Return a part of the result from the plain value of its record.
-
-    Args:
-        name: of the field of `Calibration`; value: as JSON or YAML have it.
-        where: the file, for the message.
-
-    Raises:
-        DataError: another kind or shape, or a part missing.
-    """
+    text = read_text(Path(path), stdin)
     try:
-        check_size(value)
-        return _rebuild(name, value)
-    except OverflowError:
-        raise DataError(
-            f"{where}: not a calibration result: {name}: holds a number that is too large"
-        ) from None
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise DataError(f"{where}: not a calibration result: {name}: {reason}") from None
+        record = parse_mapping(text, str(path))
+    except ConfigError as error:
+        raise ConfigError(f"{error}; the result file of a calibration was expected") from None
+    return Calibration.from_record(record, str(path))
 
 
-def _rebuild(name: str, value: Any) -> Any:
-    if name in SHAPES:
-        return _matrix(name, value)
-    if name in KINDS:
-        of_kind(value, *KINDS[name])
-    if name in SENTENCES:
-        for entry in value:
-            of_kind(entry, (str,), "text")
-    if name == "sigma":
-        return Sigma(array(value["K_a"], (3, 3)), array(value["D_a"], (3,)))
-    if name in CHOICES and value not in CHOICES[name]:
-        raise ValueError(f"{value!r} is not one of {', '.join(CHOICES[name])}")
-    if name == "g" and not 0 < of_kind(value, (int, float), "a positive number") < math.inf:
-        raise ValueError(f"{value!r} where a positive number was expected")
-    if name == "temperature" and value is not None:
-        return Temperature.from_record(value)
-    if name == "dop":
-        parameters = {key: or_infinite(v) for key, v in value["parameters"].items()}
-        kinds = {kind: or_infinite(value[kind]) for kind in ("misalignment", "scale", "bias", "worst")}
-        return Dop(**kinds, parameters=parameters)
-    if name == "poses_fit":
-        return tuple(_pose_fit(row) for row in value)
-    if name == "convergence":
-        return tuple((int(n), float(cost)) for n, cost in value)
-    if name in NUMBERS_OR_NAN:
-        return or_nan(value)
-    return tuple(value) if isinstance(value, list) else value
+RECORD_HEAD = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s|#[^\n]*\n|---\s)*(?:\{|['\"]?(?:K_a|D_a|schema)['\"]?:)")
+"""How the record of a calibration begins, as JSON or YAML in our order of keys or sorted; no table of readings does."""
 
 
-def _pose_fit(row: Mapping[str, Any]) -> PoseFit:
-    """Return one pose; a key too many or too few is a TypeError."""
-    direction = array(row["direction"], (3,), whole=True)
-    known: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
-    return PoseFit(**{**known, "direction": tuple(direction.tolist())})
-
-
-def _matrix(name: str, value: Any) -> Float:
-    found = array(value, SHAPES[name], whole=name in WHOLE)
-    if name == "K_a" and not (np.abs(found) <= LARGEST).all():
-        raise ValueError(f"holds a number beyond {LARGEST:g}")
-    if name == "K_a" and not (np.abs(found).max() >= 1 / LARGEST and np.linalg.matrix_rank(found) == 3):
-        raise ValueError("is singular; expected an invertible matrix")
-    return found
+def is_result(head: bytes) -> bool:
+    """Return whether a file that begins so is a result file rather than readings."""
+    return RECORD_HEAD.match(head) is not None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
+from accelcal_cli.config import load_mapping, shipped_parameters
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
 Robust = Literal["none", "huber", "soft-l1"]
@@ -106,3 +109,29 @@ class Settings:
             ConfigError: unknown optimizer or parameter.
         """
         return OPTIMIZERS.build(self.optimizer, self.parameters, f"optimizer {self.optimizer}")
+
+
+def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
+    """Return the settings of a calibration: shipped defaults, then a file, then the command line.
+
+    Args:
+        path: the file of `--config`, or None.
+        overrides: what the command line states; `parameters` holds settings of the optimizer.
+
+    Raises:
+        ConfigError: the file cannot be read or says something that is not known.
+    """
+    where = str(path) if path else "command line"
+    stated = load_mapping(path) if path else {}
+    stated.pop("source", None)  # documentation: the paper the numbers come from
+    merged = {**stated, **overrides}
+    name = merged.get("optimizer", Settings.optimizer)
+    own = stated.get("parameters") or {}
+    if not isinstance(own, Mapping):
+        raise ConfigError(f"{where}: parameters: expected a mapping of keys, not {own!r}")
+    if stated.get("optimizer", name) != name:
+        own = {}  # the file's parameters belong to the optimizer that the command line replaced
+    parameters = {**shipped_parameters(name), **own, **overrides.get("parameters", {})}
+    settings = from_mapping(Settings, {**merged, "parameters": parameters}, where)
+    settings.build_optimizer()
+    return settings

@@ -1,14 +1,13 @@
-"""A gravity-anomaly map: a grid in latitude and longitude, interpolated bilinearly; outside there is no value.
+"""A gravity-anomaly map: a grid in latitude and longitude, interpolated bilinearly, from a file or generated.
 
-A value beyond the edge, or beside a cell without one, is NaN: never that of the nearest edge, which would draw
-particles to it.
+A value beyond the edge, or beside a cell without one, is NaN: never that of the nearest edge, which would attract
+particles.
 
-Gravity maps from files: NetCDF and GeoTIFF through xarray and rioxarray, and XYZ text without them.
+Files are NetCDF and GeoTIFF, read by xarray and rioxarray, or XYZ text, which needs neither.
 
-Generated gravity fields: isotropic, Gaussian, with Jordan's third-order Markov covariance [jordan1972].
-
-C(d) = sigma^2 (1 + s + s^2 / 3) exp(-s), s = d / D: differentiable, with an rms slope of sigma / (sqrt(3) D) an axis.
-Drawn by circulant embedding [dietrich1997] on a grid of twice the size, negative eigenvalues set to zero.
+Generated fields are isotropic and Gaussian with Jordan's third-order Markov covariance [jordan1972],
+C(d) = sigma^2 (1 + s + s^2 / 3) exp(-s), s = d / D: differentiable, with an rms slope of sigma / (sqrt(3) D) per axis.
+They are drawn by circulant embedding [dietrich1997] on a grid of twice the size, negative eigenvalues set to zero.
 """
 
 from __future__ import annotations
@@ -27,9 +26,6 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.navigation.ins import metres_per_radian
 from accelcal_cli.rng import Purpose, Streams
 
-OUTSIDE = -1e6
-"""Log-likelihood of a place that the map does not know."""
-
 
 @dataclass(frozen=True)
 class GravityMap:
@@ -37,9 +33,9 @@ class GravityMap:
 
     Attributes:
         south, west: latitude and longitude of the first node, rad.
-        step_north, step_east: between nodes, rad.
+        step_north, step_east: spacing of the nodes, rad.
         values: mGal, shape (rows, columns), from south to north and west to east; NaN where unknown.
-        source: where it comes from.
+        source: the name of its file, or of the generated field.
     """
 
     south: float
@@ -51,7 +47,7 @@ class GravityMap:
     _flat: Float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the grid and keep it flat for the look-ups."""
+        """Check the grid, and keep a flat copy for the look-ups."""
         if self.values.ndim != 2 or min(self.values.shape) < 2:
             raise DataError(f"{self.source}: expected at least 2 x 2 nodes, not {self.values.shape}")
         if np.isnan(self.values).all():
@@ -69,7 +65,7 @@ class GravityMap:
         return float(self.west + self.step_east * (self.values.shape[1] - 1))
 
     def at(self, latitude: Float, longitude: Float) -> Float:
-        """Return the anomaly in mGal, NaN where the map has none; places in rad, any one shape."""
+        """Return the anomaly in mGal, NaN where the map has none; positions in rad, of one shape."""
         index, a, b, outside = self._cell(latitude, longitude)
         columns = self.values.shape[1]
         take = self._flat.take
@@ -84,7 +80,7 @@ class GravityMap:
         return above
 
     def slope(self, latitude: Float, longitude: Float) -> tuple[Float, Float]:
-        """Return the slopes to north and to east in mGal/rad, NaN where the map has none; places in rad."""
+        """Return the slopes to north and to east in mGal/rad, NaN where the map has none; positions in rad."""
         index, a, b, outside = self._cell(latitude, longitude)
         columns = self.values.shape[1]
         g = [self._flat.take(index + k) for k in (0, 1, columns, columns + 1)]
@@ -101,7 +97,7 @@ class GravityMap:
         i, j = np.floor(a), np.floor(b)
         outside: Bool = ~((a >= 0.0) & (a <= rows - 1) & (b >= 0.0) & (b <= columns - 1))
         for node, last in ((i, rows - 2), (j, columns - 2)):
-            np.fmax(node, 0.0, out=node)  # of a number and NaN the number: an unknown place has a cell too
+            np.fmax(node, 0.0, out=node)  # ignores NaN: an unknown position has a cell, too
             np.fmin(node, last, out=node)
         a -= i
         b -= j
@@ -113,14 +109,14 @@ class GravityMap:
 NETCDF, GEOTIFF = (".nc", ".nc4", ".grd", ".cdf"), (".tif", ".tiff")
 LATITUDES, LONGITUDES = ("lat", "latitude", "y"), ("lon", "longitude", "x")
 EVEN = 1e-3
-"""Part of a step by which the nodes of a grid may be uneven."""
+"""Unevenness of the nodes of a grid that is accepted, as a part of their spacing."""
 
 
 def load_map(path: str) -> GravityMap:
-    """Return the map in a file; its suffix says the format.
+    """Return the map in a file, whose suffix gives the format.
 
     XYZ text has three columns: longitude and latitude in degrees, anomaly in mGal, in any order of rows; `#` begins a
-    comment, and a first line that is not numbers is a header.
+    comment, and a first line that does not hold numbers is a header.
 
     Raises:
         DataError: unreadable, not a regular grid, or the packages for its format are missing.
@@ -130,9 +126,9 @@ def load_map(path: str) -> GravityMap:
     if not file.is_file():
         raise DataError(f"{path}: no such file; expected a map file, or rough, moderate or constant")
     if suffix in NETCDF + GEOTIFF:
-        return _gridded(path, suffix)
-    longitude, latitude, values = _text(path).T
-    return _grid(path, latitude, longitude, values)
+        return _read_grid(path, suffix)
+    longitude, latitude, values = _read_xyz(path).T
+    return _from_nodes(path, latitude, longitude, values)
 
 
 def digest(path: str) -> str:
@@ -143,7 +139,7 @@ def digest(path: str) -> str:
         raise DataError(f"{path}: {(error.strerror or str(error)).lower()}") from None
 
 
-def _text(path: str) -> Float:
+def _read_xyz(path: str) -> Float:
     """Return the numbers of an XYZ file, shape (n, 3)."""
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
@@ -168,7 +164,7 @@ def _text(path: str) -> Float:
     return np.array(rows)
 
 
-def _grid(path: str, latitude: Float, longitude: Float, values: Float) -> GravityMap:
+def _from_nodes(path: str, latitude: Float, longitude: Float, values: Float) -> GravityMap:
     """Return the map of scattered nodes that form a grid; a missing node is NaN."""
     if not (np.isfinite(latitude).all() and np.isfinite(longitude).all()):
         raise DataError(f"{path}: a latitude or longitude is not a number")
@@ -178,10 +174,10 @@ def _grid(path: str, latitude: Float, longitude: Float, values: Float) -> Gravit
         raise DataError(f"{path}: the points are not the nodes of a grid in latitude and longitude")
     grid = np.full((len(rows), len(columns)), np.nan)
     grid[i, j] = values
-    return _regular(path, rows, columns, grid)
+    return _regular_map(path, rows, columns, grid)
 
 
-def _regular(path: str, latitude: Float, longitude: Float, values: Float) -> GravityMap:
+def _regular_map(path: str, latitude: Float, longitude: Float, values: Float) -> GravityMap:
     """Return the map of a grid with ascending or descending axes in degrees."""
     if latitude[0] > latitude[-1]:
         latitude, values = latitude[::-1], values[::-1]
@@ -202,31 +198,31 @@ def _regular(path: str, latitude: Float, longitude: Float, values: Float) -> Gra
     return GravityMap(np.radians(latitude[0]), np.radians(longitude[0]), steps[0], steps[1], values, path)
 
 
-def _gridded(path: str, suffix: str) -> GravityMap:
+def _read_grid(path: str, suffix: str) -> GravityMap:
     """Return the map of a NetCDF or GeoTIFF file."""
     needed = "rioxarray" if suffix in GEOTIFF else "xarray"
     try:
         package: Any = importlib.import_module(needed)
     except ImportError:
         raise DataError(
-            f"{path}: needs {needed}: pip install 'accelcal[maps]' (XYZ text is read without)"
+            f"{path}: needs {needed}: pip install 'accelcal[maps]' (XYZ text needs no package)"
         ) from None
     try:
         if suffix in GEOTIFF:
             with package.open_rasterio(path, masked=True) as raster:
-                return _array(path, raster.squeeze("band", drop=True).load())
+                return _from_xarray(path, raster.squeeze("band", drop=True).load())
         with package.open_dataset(path) as data:
             grids = [v for v in data.data_vars.values() if v.squeeze().ndim == 2]
             if len(grids) != 1:
                 raise DataError(f"{path}: expected one variable on a grid, not {len(grids)}")
-            return _array(path, grids[0].squeeze().load())
+            return _from_xarray(path, grids[0].squeeze().load())
     except DataError:
         raise
     except Exception as error:  # the readers raise whatever their libraries do
         raise DataError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
 
 
-def _array(path: str, grid: Any) -> GravityMap:
+def _from_xarray(path: str, grid: Any) -> GravityMap:
     """Return the map of a two-dimensional xarray."""
     axes = []
     for known in (LATITUDES, LONGITUDES):
@@ -236,18 +232,18 @@ def _array(path: str, grid: Any) -> GravityMap:
         axes += names
     grid = grid.transpose(*axes)
     latitude, longitude = (np.asarray(grid[name].values, dtype=float) for name in axes)
-    return _regular(path, latitude, longitude, np.asarray(grid.values, dtype=float))
+    return _regular_map(path, latitude, longitude, np.asarray(grid.values, dtype=float))
 
 
 @dataclass(frozen=True)
-class Field:
-    """Statistics and extent of a generated field.
+class RandomField:
+    """Statistics and extent of a generated gravity field.
 
     Attributes:
         sigma: standard deviation, mGal.
         distance: correlation length D, km.
         south, north, west, east: edges, degrees.
-        step: between nodes, arc seconds.
+        step: spacing of the nodes, arc seconds.
     """
 
     sigma: float
@@ -260,22 +256,22 @@ class Field:
 
 
 PRESETS = {
-    "rough": Field(60.0, 8.0),
-    "moderate": Field(30.0, 11.5),
-    "constant": Field(0.0, 8.0),
+    "rough": RandomField(60.0, 8.0),
+    "moderate": RandomField(30.0, 11.5),
+    "constant": RandomField(0.0, 8.0),
 }
-"""`rough` is about as informative as the paper's results need; `moderate` is like the published statistics."""
+"""`rough` is about as informative as the paper's results need; `moderate` resembles published statistics."""
 
 
-def covariance(distance: Float, field: Field) -> Float:
+def covariance(distance: Float, field: RandomField) -> Float:
     """Return the covariance in mGal^2 at a distance in km, any shape."""
     s = distance / field.distance
     total: Float = field.sigma**2 * (1.0 + s + s * s / 3.0) * np.exp(-s)
     return total
 
 
-def generate(field: Field, seed: int, source: str = "generated") -> GravityMap:
-    """Return a field drawn from `seed`; the same seed gives the same field."""
+def generate(field: RandomField, seed: int, source: str = "generated") -> GravityMap:
+    """Return a field drawn from a seed; the same seed gives the same field."""
     step = math.radians(field.step / 3600.0)
     south, west = math.radians(field.south), math.radians(field.west)
     rows = round((math.radians(field.north) - south) / step) + 1

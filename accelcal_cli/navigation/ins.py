@@ -1,12 +1,12 @@
-"""The twelve-state error model of an inertial navigation system, continuous and discrete.
+"""The error model of an inertial navigation system (INS) in twelve states, continuous and discrete, and its Earth.
 
 State [depf2015] section 1: latitude and longitude error (rad), east and north velocity error (m/s), tilt about east and
 north and azimuth error (rad), accelerometer bias east and north (m/s^2), gyro drift about east, north and up (rad/s);
-error = indicated - true. The matrix is the standard two-channel ENU model, rebuilt: the paper's is lost.
+error = indicated - true. The matrix is the standard two-channel ENU model: the paper's own is lost.
 
-The filters work in metric states: latitude and longitude error as metres north and east, all else as above.
+The filters use metric states: latitude and longitude error as metres north and east, all else as above.
 
-The Earth of the navigation filters: WGS84 radii, normal gravity and rotation [nima2000].
+The Earth is WGS84: radii, normal gravity and rotation [nima2000].
 """
 
 from __future__ import annotations
@@ -22,17 +22,64 @@ from accelcal_cli.schema import check, setting
 
 STATES = 12
 MINUTE, TAYLOR_TERMS, LONG_TERMS = 60.0, 9, 16
-"""Of the matrix exponential, for steps up to a minute and up to ten: the next one is below rounding."""
+"""Terms of the matrix exponential, for steps up to a minute and up to ten: the next one is below rounding."""
+
+EQUATORIAL_RADIUS = 6378137.0
+"""Semi-major axis a. Units: m."""
+
+FLATTENING = 1.0 / 298.257223563
+"""Definition: (a - b) / a. Units: 1."""
+
+ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
+EARTH_RATE = 7.292115e-5
+"""Units: rad/s."""
+
+EQUATORIAL_GRAVITY, SOMIGLIANA = 9.7803253359, 1.931852652458e-3
+METRES_PER_MICRO_G = 9.80665e-6
+"""One micro-g. Units: m/s^2."""
+
+DEGREE_PER_HOUR = np.deg2rad(1.0) / 3600.0
+"""Units: rad/s."""
+
+
+def radii(latitude: Float) -> tuple[Float, Float]:
+    """Return the meridian and the prime-vertical radius of curvature, R_M and R_N, in m.
+
+    Args:
+        latitude: rad, any shape.
+    """
+    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
+    prime = EQUATORIAL_RADIUS / np.sqrt(root)
+    return prime * (1.0 - ECCENTRICITY_SQUARED) / root, prime
+
+
+def metres_per_radian(latitude: Float) -> tuple[Float, Float]:
+    """Return the metres per radian of latitude and of longitude, R_M and R_N cos L.
+
+    Args:
+        latitude: rad, any shape.
+    """
+    meridian, prime = radii(latitude)
+    return meridian, prime * np.cos(latitude)
+
+
+def somigliana_gravity(latitude: Float) -> Float:
+    """Return normal gravity on the ellipsoid in m/s^2, by Somigliana's formula; latitude in rad, any shape."""
+    sine = np.sin(latitude) ** 2
+    gravity: Float = (
+        EQUATORIAL_GRAVITY * (1.0 + SOMIGLIANA * sine) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine)
+    )
+    return gravity
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where a vehicle is and how it moves; all fields have one shape.
+    """Latitude and motion of a vehicle; all fields have the same shape.
 
     Attributes:
         latitude: rad.
         east, north: velocity, m/s.
-        force_east, force_north: acceleration over ground, m/s^2, without the Coriolis terms.
+        force_east, force_north: acceleration over ground, m/s^2, without Coriolis terms.
     """
 
     latitude: Float
@@ -43,12 +90,12 @@ class Motion:
 
 
 def specific_force(motion: Motion) -> tuple[Float, Float, Float]:
-    """Return the specific force east, north and up along a track at height 0. Units: m/s^2."""
+    """Return the specific force east, north and up at height 0. Units: m/s^2."""
     meridian, prime = radii(motion.latitude)
     tangent, sine, cosine = np.tan(motion.latitude), np.sin(motion.latitude), np.cos(motion.latitude)
     turn = 2.0 * EARTH_RATE * sine + motion.east * tangent / prime
     up = (
-        normal_gravity(motion.latitude)
+        somigliana_gravity(motion.latitude)
         - (2.0 * EARTH_RATE * cosine + motion.east / prime) * motion.east
         - motion.north**2 / meridian
     )
@@ -97,11 +144,11 @@ def discretise(A: Float, step: float) -> Float:
     return total
 
 
-def turned(F: Float, heading: Float) -> Float:
-    """Return transitions in which the level biases then turn with the vehicle.
+def turn_biases(F: Float, heading: Float) -> Float:
+    """Return transitions after which the level biases turn with the vehicle.
 
     Args:
-        F: shape (..., 12, 12); heading: change of the heading in the step, clockwise, rad, shape (...).
+        F: shape (..., 12, 12); heading: change of heading in the step, clockwise, rad, shape (...).
     """
     turn = np.zeros((*heading.shape, STATES, STATES))
     turn[..., range(STATES), range(STATES)] = 1.0
@@ -112,8 +159,8 @@ def turned(F: Float, heading: Float) -> Float:
     return product
 
 
-def metric(F: Float, before: Float, after: Float) -> Float:
-    """Return a transition of metric states: position errors in metres north and east.
+def to_metric(F: Float, before: Float, after: Float) -> Float:
+    """Return the transition of metric states, whose position errors are in metres north and east.
 
     Args:
         F: transition of the states in rad, shape (..., 12, 12).
@@ -127,23 +174,25 @@ def metric(F: Float, before: Float, after: Float) -> Float:
 
 
 @dataclass(frozen=True)
-class Grade:
-    """How good an inertial navigation system is [depf2015] Table 1.
+class InsGrade:
+    """How accurate an inertial navigation system is [depf2015] Table 1.
 
     Attributes:
         accelerometer: sigma of the constant bias, micro-g.
         gyro: sigma of the constant drift, deg/h.
-        noise: white noise of a 10 s step, as a part of what the bias and the drift do in it.
-        mounting: `platform`: level biases keep to east and north, as in [depf2015]; `strapdown`: they turn along.
+        noise: white noise of a 10 s step, as a fraction of the effect of bias and drift in that step.
+        mounting: `platform`: level biases stay fixed to east and north, as in [depf2015]; `strapdown`: they turn with
+            the vehicle.
     """
 
     accelerometer: float = setting(50.0, "sigma of the constant bias, micro-g", low=0.0, high=1e6)
     gyro: float = setting(0.01, "sigma of the constant drift, deg/h", low=0.0, high=1e4)
     noise: float = setting(
-        0.1, "white noise of 10 s, as a part of what the biases do in it", low=0.0, high=100.0
+        0.1, "white noise of 10 s, as a fraction of the effect of the biases in 10 s", low=0.0, high=100.0
     )
     mounting: Literal["platform", "strapdown"] = setting(
-        "platform", "whether level biases keep to east and north, or turn with the vehicle"
+        "platform",
+        "level biases stay fixed to east and north (platform) or turn with the vehicle (strapdown)",
     )
 
     def __post_init__(self) -> None:
@@ -152,70 +201,22 @@ class Grade:
 
     def biases(self) -> Float:
         """Return sigma of the five biases: m/s^2 (2), rad/s (3)."""
-        return np.array([self.accelerometer * MICRO_G] * 2 + [self.gyro * DEGREE_PER_HOUR] * 3)
+        return np.array([self.accelerometer * METRES_PER_MICRO_G] * 2 + [self.gyro * DEGREE_PER_HOUR] * 3)
 
     def white(self) -> Float:
-        """Return the noise densities of velocity and attitude: m/s (2) and rad (3) in the root of a second."""
+        """Return the noise densities of velocity and attitude: m/s (2) and rad (3) per root second."""
         return self.noise * math.sqrt(10.0) * self.biases()
 
 
-def process_noise(grade: Grade, step: float, position: float = 0.0) -> Float:
-    """Return the variances of one step's noise of the metric states, shape (12,).
+def process_noise(grade: InsGrade, step: float, position: float = 0.0) -> Float:
+    """Return the variances of the process noise of one step in metric states, shape (12,).
 
     Args:
         grade: of the INS.
         step: s.
-        position: noise added to the position error in a step, m.
+        position: noise added to the position error per step, m.
     """
     variances = np.zeros(STATES)
     variances[:2] = position**2
     variances[2:7] = grade.white() ** 2 * step
     return variances
-
-
-EQUATORIAL_RADIUS = 6378137.0
-"""Semi-major axis a. Units: m."""
-
-FLATTENING = 1.0 / 298.257223563
-"""Definition: (a - b) / a. Units: 1."""
-
-ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
-EARTH_RATE = 7.292115e-5
-"""Units: rad/s."""
-
-EQUATORIAL_GRAVITY, SOMIGLIANA = 9.7803253359, 1.931852652458e-3
-MICRO_G = 9.80665e-6
-"""Units: m/s^2."""
-
-DEGREE_PER_HOUR = np.deg2rad(1.0) / 3600.0
-"""Units: rad/s."""
-
-
-def radii(latitude: Float) -> tuple[Float, Float]:
-    """Return the meridian and the prime-vertical radius of curvature, R_M and R_N, in m.
-
-    Args:
-        latitude: rad, any shape.
-    """
-    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
-    prime = EQUATORIAL_RADIUS / np.sqrt(root)
-    return prime * (1.0 - ECCENTRICITY_SQUARED) / root, prime
-
-
-def metres_per_radian(latitude: Float) -> tuple[Float, Float]:
-    """Return the metres of one radian of latitude and of longitude, R_M and R_N cos L.
-
-    Args:
-        latitude: rad, any shape.
-    """
-    meridian, prime = radii(latitude)
-    return meridian, prime * np.cos(latitude)
-
-
-def normal_gravity(latitude: Float) -> Float:
-    """Return normal gravity on the ellipsoid in m/s^2, by Somigliana's formula; latitude in rad, any shape."""
-    sine = np.sin(latitude) ** 2
-    gravity: Float = (
-        EQUATORIAL_GRAVITY * (1.0 + SOMIGLIANA * sine) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine)
-    )
-    return gravity

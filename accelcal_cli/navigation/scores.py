@@ -1,8 +1,7 @@
-"""What a track is worth: errors, consistency and lock of every run, against the true position.
+"""Scores of a filter's estimates: errors, consistency and lock of every run, against the true position.
 
-The posterior Cramer-Rao bound of a scenario: what no filter's mean square error is below [tichavsky1998].
-
-The system is linear but for the map, and the noise is Gaussian; the recursion is then that of a Kalman filter whose
+Also the posterior Cramer-Rao bound of a scenario, below which no filter's mean square error can be [tichavsky1998]. The
+system is linear except for the map, and the noise is Gaussian: the recursion is that of a Kalman filter whose
 measurement matrix is the slope of the map at the true position.
 """
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.navigation.ins import metres_per_radian, process_noise
-from accelcal_cli.navigation.particle_filter import Track
+from accelcal_cli.navigation.particle_filter import PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario, transitions
 from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR
 
@@ -22,10 +21,10 @@ SETTLED = 3.0
 """Hour of the voyage from which errors count [depf2015] section 4."""
 
 ASTRAY = 0.1
-"""A run whose error is above the initial one for more than this part of the time has lost lock."""
+"""A run whose error exceeds the initial one for more than this part of the time has lost lock."""
 
 DIVERGED = 5.0
-"""A run whose last error is more than so many times the initial one has diverged."""
+"""A run whose last error exceeds the initial one by more than this factor has diverged."""
 
 
 @dataclass(frozen=True)
@@ -51,24 +50,24 @@ class Scores:
 
 
 def counted(scenario: Scenario) -> Bool:
-    """Return which epochs count, shape (K,): those from hour 3, or all of a voyage that ends before."""
+    """Return which epochs count, shape (K,): those from hour 3 on, or all if the voyage ends before."""
     late: Bool = scenario.seconds >= SETTLED * SECONDS_PER_HOUR
     return late if late.any() else np.ones_like(late)
 
 
-def score(scenario: Scenario, track: Track) -> Scores:
-    """Return the scores of a track."""
+def score(scenario: Scenario, estimates: PositionEstimates) -> Scores:
+    """Return the scores of a filter's estimates."""
     late = counted(scenario)
-    truth = np.full(track.mean.shape, np.nan) if scenario.error is None else scenario.error
-    error = track.mean - truth
+    truth = np.full(estimates.mean.shape, np.nan) if scenario.error is None else scenario.error
+    error = estimates.mean - truth
     square = np.square(error[:, late])
     total = square.sum(axis=2)
     ins = np.square(truth[:, late]).sum(axis=2).mean(axis=1)
-    variance = np.einsum("rkii->rk", track.covariance[:, late]).mean(axis=1)
-    blind = track.blind > 0.5 * scenario.epochs
+    variance = np.einsum("rkii->rk", estimates.covariance[:, late]).mean(axis=1)
+    blind = estimates.blind > 0.5 * scenario.epochs
     known = scenario.error is not None
-    lost = ~np.isfinite(track.mean).all(axis=(1, 2)) | blind
-    far = np.square(track.mean[:, -1] - truth[:, -1]).sum(axis=1)
+    lost = ~np.isfinite(estimates.mean).all(axis=(1, 2)) | blind
+    far = np.square(estimates.mean[:, -1] - truth[:, -1]).sum(axis=1)
     if known:
         astray = ~(total <= scenario.initial**2)
         lost = lost | astray[:, -1] | (astray.mean(axis=1) > ASTRAY)
@@ -78,7 +77,7 @@ def score(scenario: Scenario, track: Track) -> Scores:
         square[..., 0].mean(axis=1),
         square[..., 1].mean(axis=1),
         ins,
-        _nees(error[:, late], track.covariance[:, late]),
+        _nees(error[:, late], estimates.covariance[:, late]),
         np.sqrt(variance),
         lost,
         diverged,
@@ -86,7 +85,7 @@ def score(scenario: Scenario, track: Track) -> Scores:
 
 
 def _nees(error: Float, covariance: Float) -> Float:
-    """Return the mean of e^T P^-1 e, shape (R,); a cloud narrower than 1 mm counts as 1 mm."""
+    """Return the mean of e^T P^-1 e, shape (R,); a standard deviation below 1 mm counts as 1 mm."""
     a, b, c = covariance[..., 0, 0] + 1e-6, covariance[..., 0, 1], covariance[..., 1, 1] + 1e-6
     north, east = error[..., 0], error[..., 1]
     value: Float = ((c * north - 2.0 * b * east) * north + a * east**2) / (a * c - b * b)
@@ -97,17 +96,13 @@ def _nees(error: Float, covariance: Float) -> Float:
 def bound(scenario: Scenario) -> Float:
     """Return the least variances of the position error north and east at every epoch, m^2, shape (K, 2).
 
-    A measurement that is missing, or taken where the map has no value, tells nothing.
+    A measurement that is missing, or taken where the map has no value, gives no information.
     """
-    route = scenario.route
-    latitude = np.atleast_2d(route.latitude)[0]
-    longitude = np.atleast_2d(route.longitude)[0]
-    north, east = scenario.gravity_map.slope(latitude, longitude)
-    slope = np.stack([north, east], axis=-1) / np.stack(metres_per_radian(latitude), axis=-1)
+    true = scenario.true
+    slope = np.stack(scenario.gravity_map.slope(true.latitude, true.longitude), axis=-1)
+    slope /= np.stack(metres_per_radian(true.latitude), axis=-1)
     slope[np.isnan(slope).any(axis=1) | np.isnan(scenario.measured[0])] = 0.0
-    F = transitions(route, scenario.turns, (0, scenario.epochs), scenario.period, scenario.grade).reshape(
-        -1, 12, 12
-    )
+    F = transitions(true, scenario.turns, scenario.grade, 0, scenario.epochs)
     Q = np.diag(process_noise(scenario.grade, scenario.period))
     P = np.diag(scenario.prior())
     out = np.empty((scenario.epochs, 2))

@@ -1,190 +1,99 @@
-"""The navigation study: filters on many runs of one voyage, beside the bound and the INS alone.
+"""The navigation study: filters on many runs of one voyage, compared with the bound and the INS alone.
 
-The curves of a navigation study's records: errors, corrected place and claimed sigma of a run against time.
-
-What a navigation study runs on: map, voyage, INS and gravimeter, from names, files and YAML.
+Its settings come from YAML: map, voyage, INS, gravimeter and filters. Its records hold the scores of a run, and errors,
+corrected position and claimed sigma against time. Its statistics are one row per filter, and RMSE against time.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, DataError, did_you_mean
 from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, digest, generate, load_map
-from accelcal_cli.navigation.ins import MICRO_G, Grade, metres_per_radian
-from accelcal_cli.navigation.particle_filter import FILTERS, Filter, Track
-from accelcal_cli.navigation.scenario import Scenario, check_coverage, read_voyage, recorded, simulate
-from accelcal_cli.navigation.scores import Scores, score
-from accelcal_cli.navigation.voyage import Plan, planned
+from accelcal_cli.navigation.ins import METRES_PER_MICRO_G, InsGrade, metres_per_radian
+from accelcal_cli.navigation.particle_filter import FILTERS, Filter, PositionEstimates
+from accelcal_cli.navigation.scenario import Scenario, check_coverage, from_recording, read_voyage, simulate
+from accelcal_cli.navigation.scores import SETTLED, Scores, bound, counted, score
+from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR, PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.schema import build, check, setting
+from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
-from accelcal_cli.studies.study import Record, Study, Task
+from accelcal_cli.studies.study import Record, Row, Study, Task, records_of_cell
 
 
 @dataclass(frozen=True)
-class Navigation(Study):
-    """Every filter with every grade of INS; one cell a pair.
+class FilterEntry:
+    """A filter in a study: its name, its label in the tables, and the settings that differ from its defaults.
 
-    Attributes:
-        waters: map, voyage, gravimeter.
-        entries: the filters.
-        grades: of the INS: one, or without and with a calibration.
-        repeats: runs of each; seed: of all of them.
+    Raises:
+        ConfigError: an unknown filter or setting, or a value that the filter does not permit.
     """
 
-    waters: Waters
-    entries: tuple[FilterEntry, ...]
-    grades: tuple[Grade, ...]
-    repeats: int = 20
-    seed: int = 0
+    filter: str
+    label: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what the filter does not know."""
+        self.build()
+
+    def build(self) -> Filter:
+        """Return the filter."""
+        return FILTERS.build(self.filter, self.parameters, self.name)
 
     @property
-    def cells(self) -> int:
-        """Filters times grades."""
-        return len(self.entries) * len(self.grades)
+    def name(self) -> str:
+        """Its label, or else the name of the filter."""
+        return self.label or self.filter
 
-    @property
-    def runs(self) -> int:
-        """Runs of each cell."""
-        return self.repeats
-
-    @property
-    def block(self) -> int:
-        """Runs of one task: of fewer, what numpy does besides the arithmetic is a third of the time."""
-        return 50
-
-    def part(self, cell: int) -> tuple[FilterEntry, Grade]:
-        """Return filter and grade of a cell."""
-        grade, entry = divmod(cell, len(self.entries))
-        return self.entries[entry], self.grades[grade]
-
-    def names(self, cell: int) -> dict[str, str]:
-        """Return what identifies a cell."""
-        entry, grade = self.part(cell)
-        return {
-            "filter": entry.label,
-            "mode": str(entry.parameters.get("mode", "default")),
-            "accelerometer_ug": f"{grade.accelerometer:.6g}",
-        }
-
-    def execute(self, task: Task) -> list[Record]:
-        """Return the records of a task's runs."""
-        runs = range(task.first, task.last)
-        entry, grade = self.part(task.cell)
-        scenario = self.waters.scenario(grade, runs, self.seed)
-        begin = time.perf_counter()
-        with np.errstate(all="ignore"):  # a diverging filter overflows; its score says so
-            track = entry.build().run(scenario, Streams(self.seed, runs, Purpose.FILTER))
-            scores = score(scenario, track)
-        seconds = (time.perf_counter() - begin) / len(runs)
-        return [_record(task, i, scenario, track, scores, seconds) for i in range(len(runs))]
+    def with_settings(self, stated: Mapping[str, Any]) -> FilterEntry:
+        """Return the filter with settings of the command line; None, and a setting that it lacks, are left out."""
+        known = {f.name for f in fields(FILTERS.get(self.filter))}
+        own = {name: value for name, value in stated.items() if value is not None and name in known}
+        return replace(self, parameters={**self.parameters, **own})
 
 
-def _record(task: Task, i: int, scenario: Scenario, track: Track, scores: Scores, seconds: float) -> Record:
-    status = "diverged" if scores.diverged[i] else "lost" if scores.lost[i] else "kept"
-    values = {
-        "mean_square_latitude": scores.north[i],
-        "mean_square_longitude": scores.east[i],
-        "mean_square_ins": scores.ins[i],
-        "nees": scores.nees[i],
-        "sigma_m": scores.sigma[i],
-        "blind": track.blind[i],
-        "lookups": track.lookups,
-    }
-    return Record(
-        task.cell,
-        task.first + i,
-        float(np.sqrt(scores.north[i] + scores.east[i])),
-        round(track.lookups * scenario.epochs),
-        scenario.epochs,
-        status,
-        None,
-        {name: float(v) if np.isfinite(v) else None for name, v in values.items()},
-        curve_of(i, scenario, track, scores),
-        seconds,
-    )
-
-
-EVERY = 300.0
-"""Seconds between the points of a record's curves."""
-
-AXES = ("north", "east", "latitude", "longitude", "sigma")
-OFFSET = 10_000_000
-"""A record's curve holds one block for each of AXES, its seconds moved by so much."""
-
-
-def curve_of(i: int, scenario: Scenario, track: Track, scores: Scores) -> tuple[tuple[int, float], ...]:
-    """Return errors north and east, corrected place (degrees) and claimed sigma of a run, block by block."""
-    stride = stride_of(scenario)
-    seconds = scenario.seconds[::stride]
-    latitude = scenario.ins.latitude[i, ::stride]
-    meridian, parallel = metres_per_radian(latitude)
-    blocks = (
-        scores.error[i, ::stride, 0],
-        scores.error[i, ::stride, 1],
-        np.degrees(latitude - track.mean[i, ::stride, 0] / meridian),
-        np.degrees(scenario.ins.longitude[i, ::stride] - track.mean[i, ::stride, 1] / parallel),
-        np.sqrt(np.einsum("kii->k", track.covariance[i, ::stride])),
-    )
-    return tuple(
-        (round(second) + OFFSET * axis, float(value))
-        for axis, block in enumerate(blocks)
-        for second, value in zip(seconds, block, strict=True)
-        if np.isfinite(value)
-    )
-
-
-def stride_of(scenario: Scenario) -> int:
-    """Return the epochs between the points of a curve."""
-    return max(1, round(EVERY / scenario.period))
-
-
-def axis_of(record: Record, axis: str) -> tuple[Float, Float]:
-    """Return seconds and one of AXES of a record's curve, both of shape (points,)."""
-    first = AXES.index(axis) * OFFSET
-    points = [(n - first, value) for n, value in record.curve if first <= n < first + OFFSET]
-    seconds, values = np.array(points).T if points else (np.empty(0), np.empty(0))
-    return seconds, values
-
-
-def mean_squares(records: Sequence[Record], axis: str) -> dict[float, float]:
-    """Return the mean square over runs at each second."""
-    total: dict[float, list[float]] = {}
-    for record in records:
-        for second, value in zip(*axis_of(record, axis), strict=True):
-            total.setdefault(float(second), []).append(float(value) ** 2)
-    return {second: float(np.mean(values)) for second, values in total.items()}
+def filter_names() -> list[str]:
+    """Return the names of all filters, in the order of the tables."""
+    order = ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
+    return sorted(FILTERS.names(), key=lambda name: order.index(name) if name in order else len(order))
 
 
 @dataclass(frozen=True)
-class Waters:
-    """Where and with what a study sails.
+class NavigationSettings:
+    """Map, voyage, INS, gravimeter and filters of a study; its fields are the keys of its file.
 
     Attributes:
-        plan: the voyage; ins: its INS.
+        plan: the planned voyage; ins: its INS.
+        paper: RMSE of the position that a paper reports, m, by filter.
     """
 
     map: str = setting(
         "rough", "rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, XYZ text"
     )
     map_seed: int | None = setting(None, "of a generated map; not set: the study's seed", low=0)
-    voyage: str = setting("", "CSV file of a recorded voyage; without one it is planned")
-    plan: Plan = field(default_factory=Plan, metadata={"doc": "the planned voyage"})
-    ins: Grade = field(default_factory=Grade, metadata={"doc": "the INS"})
+    voyage: str = setting("", "CSV file of a recorded voyage; without one the voyage is planned")
+    plan: PlannedVoyage = setting(PlannedVoyage(), "the planned voyage")
+    ins: InsGrade = setting(InsGrade(), "the INS")
     period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
     noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", low=1e-3, high=1000.0)
     initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
+    runs: int = setting(20, "runs of each filter", low=1, high=100_000)
+    seed: int = setting(0, "seed of all random numbers", low=0)
+    filters: tuple[FilterEntry, ...] = ()
+    title: str = ""
+    source: str = ""
+    note: str = ""
+    paper: dict[str, Any] = field(default_factory=dict)
     digests: str = field(default="", metadata={"doc": "SHA-256 of the files"})
 
     def __post_init__(self) -> None:
@@ -199,11 +108,11 @@ class Waters:
             )
 
     def files(self) -> list[str]:
-        """Return the files that are read: map and voyage, as far as they are none of ours."""
-        return [path for path in (self.map if self.map not in PRESETS else "", self.voyage) if path]
+        """Return the files that are read: a map that is not generated, and a recorded voyage."""
+        return [path for path in ("" if self.map in PRESETS else self.map, self.voyage) if path]
 
-    def hashed(self) -> Waters:
-        """Return the same with the hashes of its files, so that other contents are another study."""
+    def with_digests(self) -> NavigationSettings:
+        """Return the settings with the hashes of their files, so that other contents make another study."""
         if self.map not in PRESETS and not Path(self.map).suffix and not Path(self.map).exists():
             raise ConfigError(
                 f'unknown map "{self.map}"{did_you_mean(self.map, PRESETS)}; known: {", ".join(PRESETS)}, or the path '
@@ -211,128 +120,51 @@ class Waters:
             )
         return replace(self, digests=" ".join(map(digest, self.files())))
 
-    def gravity_map(self, seed: int) -> GravityMap:
+    def gravity_map(self) -> GravityMap:
         """Return the map. Raises DataError when its file cannot be used."""
         if self.map not in PRESETS:
             return load_map(self.map)
-        return generate(PRESETS[self.map], seed if self.map_seed is None else self.map_seed, self.map)
+        return generate(PRESETS[self.map], self.seed if self.map_seed is None else self.map_seed, self.map)
 
-    def scenario(self, grade: Grade, runs: range, seed: int) -> Scenario:
-        """Return the scenario of some runs; the map must cover its track.
+    def scenario(self, grade: InsGrade, runs: range) -> Scenario:
+        """Return the scenario of some runs; the map must cover its trajectory.
 
         Raises:
-            DataError: a file that cannot be used, or a map that ends inside the track.
+            DataError: a file that cannot be used, or a map that ends near the trajectory.
         """
-        gravity_map = self.gravity_map(seed)
+        gravity_map, seed, noise, initial = self.gravity_map(), self.seed, self.noise, self.initial
         if self.voyage:
-            found = recorded(
-                read_voyage(self.voyage, self.period),
-                gravity_map,
-                grade,
-                self.noise,
-                self.initial,
-                runs,
-                seed,
+            columns = read_voyage(self.voyage, self.period)
+            recorded = from_recording(
+                columns, gravity_map, grade, runs=runs, seed=seed, noise=noise, initial=initial
             )
-            check_coverage(gravity_map, found.route, self.initial)
-            return found
-        check_coverage(gravity_map, planned(self.plan), self.initial)
+            check_coverage(gravity_map, recorded.true, initial)
+            return recorded
+        check_coverage(gravity_map, self.plan.trajectory(), initial)
         return simulate(
-            gravity_map, self.plan, grade, runs=runs, seed=seed,
-            period=self.period, noise=self.noise, initial=self.initial,
+            gravity_map, self.plan, grade, runs=runs, seed=seed, period=self.period, noise=noise, initial=initial
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Repeats:
-    """How often a study runs, and by which random numbers."""
-
-    runs: int = setting(20, "runs", low=1, high=100_000)
-    seed: int = setting(0, "seed of all random numbers", low=0)
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
-
-
-@dataclass(frozen=True)
-class FilterEntry:
-    """A filter in a study: its label in the tables, its name, and what differs from its defaults."""
-
-    label: str
-    filter: str
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-    def build(self) -> Filter:
-        """Return the filter. Raises ConfigError when name or parameters are unknown."""
-        return FILTERS.build(self.filter, self.parameters, self.label)
-
-
-def filter_names() -> list[str]:
-    """Return the names of all filters, in the order in which the tables show them."""
-    order = ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
-    return sorted(FILTERS.names(), key=lambda name: order.index(name) if name in order else len(order))
-
-
-def limited(entry: FilterEntry, stated: Mapping[str, Any]) -> FilterEntry:
-    """Return a filter with what the command line states; a setting it does not have is left out.
-
-    Raises:
-        ConfigError: an unknown filter, or a value that it does not permit.
-    """
-    known = {f.name for f in fields(FILTERS.get(entry.filter))}  # type: ignore[arg-type]
-    own = {name: value for name, value in stated.items() if value is not None and name in known}
-    changed = replace(entry, parameters={**entry.parameters, **own})
-    changed.build()
-    return changed
-
-
-def load_waters(
-    path: Path | str | None, stated: Mapping[str, Any]
-) -> tuple[Waters, list[FilterEntry], dict[str, Any]]:
-    """Return waters, filters, and the remaining keys `runs`, `seed`, `title`, ... of a study's file.
+def load_study(path: Path | str | None, stated: Mapping[str, Any]) -> NavigationSettings:
+    """Return the settings of a study.
 
     Args:
         path: YAML file, the name of a shipped study, or None.
-        stated: what the command line says instead.
+        stated: settings on the command line, which replace those of the file; None is not stated.
     """
     files = shipped("studies")
     file = files[path] if isinstance(path, str) and path in files else path
     content = load_mapping(Path(file)) if file else {}
-    where = str(file) if file else "command line"
-    listed = content.pop("filters", [])
-    further = {key: content.pop(key) for key in FURTHER if key in content}
-    waters = build(Waters, {**content, **{k: v for k, v in stated.items() if v is not None}}, where)
-    if not isinstance(listed, list):
-        raise ConfigError(f"{where}: filters: expected a list of filters with their parameters")
-    entries = [_entry(item, f"{where}: filters[{n}]") for n, item in enumerate(listed, 1)]
-    return waters, entries, further
+    content |= {key: value for key, value in stated.items() if value is not None}
+    return from_mapping(NavigationSettings, content, str(file or "command line"))
 
 
-FURTHER = ("title", "source", "note", "runs", "seed", "paper")
-"""Keys of a study's file that are not of its waters."""
+def grade_of(calibration: Calibration, grade: InsGrade, where: str) -> InsGrade:
+    """Return an INS whose accelerometers are as accurate as a calibration says.
 
-
-@dataclass(frozen=True)
-class _Stated:
-    filter: str
-    label: str = ""
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-
-def _entry(item: Any, where: str) -> FilterEntry:
-    if not isinstance(item, Mapping) or "filter" not in item:
-        raise ConfigError(f'{where}: expected a mapping with the key "filter"')
-    stated = build(_Stated, item, where)
-    FILTERS.build(stated.filter, stated.parameters, where)
-    return FilterEntry(stated.label or stated.filter, stated.filter, stated.parameters)
-
-
-def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
-    """Return an INS whose accelerometers are as good as a calibration says.
-
-    The sigma of D_a by the diagonal of K_a, root mean square over the axes, is the sigma of the bias. In gauge `full`
-    the axes may lie anywhere in the body: there it is the diagonal in gauge `lower`.
+    The sigma of the bias is that of D_a over the diagonal of K_a, root mean square over the axes. In gauge `full` the
+    axes may lie anywhere in the body: there it is the diagonal in gauge `lower`.
 
     Raises:
         DataError: the calibration does not determine the biases.
@@ -341,9 +173,251 @@ def grade_of(calibration: Calibration, grade: Grade, where: str) -> Grade:
     sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(K))
     if calibration.unit == "g":
         sigma = sigma * STANDARD_GRAVITY
-    value = float(np.sqrt(np.mean(np.square(sigma)))) / MICRO_G
+    value = float(np.sqrt(np.mean(np.square(sigma)))) / METRES_PER_MICRO_G
     if not math.isfinite(value) or value <= 0:
         raise DataError(
             f"{where}: the calibration states no sigma of the biases (verdict {calibration.verdict})"
         )
     return replace(grade, accelerometer=value)
+
+
+@dataclass(frozen=True)
+class Navigation(Study):
+    """Every filter with every grade of INS; one cell per pair.
+
+    Attributes:
+        settings: of the study.
+        entries: the filters.
+        grades: of the INS: one, or without and with a calibration.
+    """
+
+    settings: NavigationSettings
+    entries: tuple[FilterEntry, ...]
+    grades: tuple[InsGrade, ...]
+
+    @property
+    def cells(self) -> int:
+        """Filters times grades."""
+        return len(self.entries) * len(self.grades)
+
+    @property
+    def runs(self) -> int:
+        """Runs of each cell."""
+        return self.settings.runs
+
+    @property
+    def block(self) -> int:
+        """Runs per task: with fewer, a third of the time goes into numpy's overhead."""
+        return 50
+
+    def part(self, cell: int) -> tuple[FilterEntry, InsGrade]:
+        """Return filter and grade of a cell."""
+        grade, entry = divmod(cell, len(self.entries))
+        return self.entries[entry], self.grades[grade]
+
+    def names(self, cell: int) -> dict[str, str]:
+        """Return what identifies a cell."""
+        entry, grade = self.part(cell)
+        return {
+            "filter": entry.name,
+            "mode": str(entry.parameters.get("mode", "default")),
+            "accelerometer_ug": f"{grade.accelerometer:.6g}",
+        }
+
+    def execute(self, task: Task) -> list[Record]:
+        """Return the records of a task's runs."""
+        runs = range(task.first, task.last)
+        entry, grade = self.part(task.cell)
+        scenario = self.settings.scenario(grade, runs)
+        begin = time.perf_counter()
+        with np.errstate(all="ignore"):  # a diverging filter overflows; its score says so
+            estimates = entry.build().run(scenario, Streams(self.settings.seed, runs, Purpose.FILTER))
+            scores = score(scenario, estimates)
+        seconds = (time.perf_counter() - begin) / len(runs)
+        return [_record(task, i, scenario, estimates, scores, seconds) for i in range(len(runs))]
+
+
+def _record(
+    task: Task, i: int, scenario: Scenario, estimates: PositionEstimates, scores: Scores, seconds: float
+) -> Record:
+    """Return the record of the i-th run of a task."""
+    values = {
+        "mean_square_latitude": scores.north[i],
+        "mean_square_longitude": scores.east[i],
+        "mean_square_ins": scores.ins[i],
+        "nees": scores.nees[i],
+        "sigma_m": scores.sigma[i],
+        "blind": estimates.blind[i],
+        "lookups": estimates.lookups,
+    }
+    return Record(
+        task.cell,
+        task.first + i,
+        cost=float(np.sqrt(scores.north[i] + scores.east[i])),
+        evaluations=round(estimates.lookups * scenario.epochs),
+        iterations=scenario.epochs,
+        status="diverged" if scores.diverged[i] else "lost" if scores.lost[i] else "kept",
+        hit=None,
+        values={name: float(v) if np.isfinite(v) else None for name, v in values.items()},
+        curve=_curve(i, scenario, estimates, scores),
+        seconds=seconds,
+    )
+
+
+EVERY = 300.0
+"""Seconds between the points of a record's curve."""
+
+AXES = ("north", "east", "latitude", "longitude", "sigma")
+"""Values of a point after its seconds: errors (m), corrected position (degrees), claimed sigma (m); NaN if unknown."""
+
+
+def _curve(
+    i: int, scenario: Scenario, estimates: PositionEstimates, scores: Scores
+) -> tuple[tuple[float, ...], ...]:
+    """Return the curve of the i-th run: seconds and AXES of each point."""
+    points = slice(None, None, _stride(scenario))
+    latitude, longitude = scenario.ins.latitude[i, points], scenario.ins.longitude[i, points]
+    meridian, parallel = metres_per_radian(latitude)
+    columns = (
+        np.rint(scenario.seconds[points]).astype(int),
+        scores.error[i, points, 0],
+        scores.error[i, points, 1],
+        np.degrees(latitude - estimates.mean[i, points, 0] / meridian),
+        np.degrees(longitude - estimates.mean[i, points, 1] / parallel),
+        np.sqrt(np.einsum("kii->k", estimates.covariance[i, points])),
+    )
+    return tuple(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _stride(scenario: Scenario) -> int:
+    """Return the epochs between the points of a curve."""
+    return max(1, round(EVERY / scenario.period))
+
+
+def axis_of(record: Record, axis: str) -> dict[int, float]:
+    """Return one of AXES of a record's curve by second, where it is known."""
+    at = AXES.index(axis) + 1
+    return {int(point[0]): point[at] for point in record.curve if math.isfinite(point[at])}
+
+
+def statistics(study: Navigation, records: Sequence[Record]) -> list[Row]:
+    """Return one row per cell: errors over hours 3 to 8 in m, bound, lost runs, consistency, time.
+
+    Definition:
+        rmse_position_m, rmse_latitude_m, rmse_longitude_m: root mean square errors; ins_m: of the INS alone.
+        circular_95_m: radius that holds 95 % of the position errors.
+        bound_m: root of the mean bound on the squared position error; bound_ratio: RMSE over it.
+        lost, diverged: numbers of runs; nees: mean normalised error squared; lookups: of the map, per run and epoch.
+        seconds: time of all runs, s; epoch_us: of one run and epoch, microseconds.
+    """
+    bounds = []
+    for grade in study.grades:
+        scenario = study.settings.scenario(grade, range(1))
+        bounds.append(float(np.sqrt(bound(scenario)[counted(scenario)].sum(axis=1).mean())))
+    return [
+        _row(study, cell, records_of_cell(records, cell), bounds[cell // len(study.entries)])
+        for cell in range(study.cells)
+    ]
+
+
+def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) -> Row:
+    """Return the statistics of one cell; least: its bound, m."""
+    entry, grade = study.part(cell)
+    north, east, ins, nees, lookups = (
+        _mean(record.values[name] for record in records)
+        for name in ("mean_square_latitude", "mean_square_longitude", "mean_square_ins", "nees", "lookups")
+    )
+    position = float(np.sqrt(north + east))
+    seconds = sum(record.seconds for record in records)
+    return {
+        "filter": entry.name,
+        "mode": study.names(cell)["mode"],
+        "accelerometer_ug": grade.accelerometer,
+        "runs": len(records),
+        "rmse_position_m": position,
+        "rmse_latitude_m": float(np.sqrt(north)),
+        "rmse_longitude_m": float(np.sqrt(east)),
+        "circular_95_m": _circular_95(records),
+        "bound_m": least,
+        "bound_ratio": position / least,
+        "ins_m": float(np.sqrt(ins)),
+        "lost": sum(record.status != "kept" for record in records),
+        "diverged": sum(record.status == "diverged" for record in records),
+        "nees": nees,
+        "lookups": lookups,
+        "seconds": seconds,
+        "epoch_us": 1e6 * seconds / sum(record.iterations for record in records),
+    }
+
+
+def _mean(values: Iterable[float | None]) -> float:
+    """Return the mean, NaN where a value is missing."""
+    return float(np.mean([np.nan if value is None else value for value in values]))
+
+
+def _circular_95(records: Sequence[Record]) -> float:
+    """Return the radius that holds 95 % of the errors from hour 3 on, at the points of the curves, m."""
+    errors: list[float] = []
+    for record in records:
+        north, east = axis_of(record, "north"), axis_of(record, "east")
+        late = min(SETTLED * SECONDS_PER_HOUR, max(north, default=0))
+        errors += [np.hypot(north[second], east[second]) for second in north if second >= late]
+    return float(np.percentile(errors, 95)) if errors else float("nan")
+
+
+INS, BOUND = "INS alone", "bound"
+"""Names of the curves that are not of a filter."""
+
+
+def rmse_curves(study: Navigation, records: Sequence[Record]) -> list[tuple[Any, ...]]:
+    """Return RMSE against time of every filter, then of the INS alone and the bound for each grade of INS.
+
+    A row holds filter, mode, micro-g, seconds; RMSE of latitude, longitude and position, m; latitude and longitude of
+    run 0, corrected or of the INS alone, degrees, and its claimed sigma, m. None is unknown.
+    """
+    rows: list[tuple[Any, ...]] = []
+    for cell in range(study.cells):
+        names, own = study.names(cell), records_of_cell(records, cell)
+        first = {axis: axis_of(own[0], axis) for axis in AXES}
+        north, east = (_mean_squares(own, axis) for axis in ("north", "east"))
+        for second, sigma in first["sigma"].items():
+            place = first["latitude"].get(second), first["longitude"].get(second)
+            rmse = _roots(north.get(second), east.get(second))
+            label = names["filter"], names["mode"], float(names["accelerometer_ug"])
+            rows.append((*label, second, *rmse, *place, sigma))
+    for grade in study.grades:
+        rows += _limits(study, grade)
+    return rows
+
+
+def _limits(study: Navigation, grade: InsGrade) -> list[tuple[Any, ...]]:
+    """Return the rows of the INS alone, over the study's runs, and of the bound."""
+    scenario = study.settings.scenario(grade, range(study.runs))
+    at = slice(None, None, _stride(scenario))
+    indicated = np.degrees([scenario.ins.latitude[0, at], scenario.ins.longitude[0, at]]).T
+    alone: Any = [(None, None)] * len(indicated)
+    if scenario.error is not None:
+        alone = np.square(scenario.error[:, at]).mean(axis=0)
+    rows: list[tuple[Any, ...]] = []
+    for name, squares in ((INS, alone), (BOUND, bound(scenario)[at])):
+        for k, second in enumerate(scenario.seconds[at]):
+            place = indicated[k] if name == INS else (None, None)
+            label = name, "", float(f"{grade.accelerometer:.6g}")
+            rows.append((*label, round(second), *_roots(*squares[k]), *place, None))
+    return rows
+
+
+def _mean_squares(records: Sequence[Record], axis: str) -> dict[int, float]:
+    """Return the mean square over runs at each second."""
+    squares: dict[int, list[float]] = {}
+    for record in records:
+        for second, value in axis_of(record, axis).items():
+            squares.setdefault(second, []).append(value**2)
+    return {second: float(np.mean(values)) for second, values in squares.items()}
+
+
+def _roots(north: float | None, east: float | None) -> tuple[float | None, float | None, float | None]:
+    """Return the roots of mean squares north and east, and of their sum."""
+    if north is None or east is None:
+        return None if north is None else north**0.5, None if east is None else east**0.5, None
+    return float(north**0.5), float(east**0.5), float((north + east) ** 0.5)

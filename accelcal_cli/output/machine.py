@@ -1,9 +1,4 @@
-"""Tables and records for programs: CSV and JSON.
-
-The raw results of a study in a file, one row a run: CSV or Parquet by its suffix.
-
-A simulated raw log as CSV.
-"""
+"""Tables and records for programs: CSV, JSON and Parquet, result files of a fleet, and simulated logs."""
 
 from __future__ import annotations
 
@@ -11,25 +6,29 @@ import csv
 import json
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from accelcal_cli.output.files import whole_file
-from accelcal_cli.sensor.simulation import Stretch
+from accelcal_cli.schema import to_mapping
 from accelcal_cli.table import Table
 
 if TYPE_CHECKING:
     import polars
 
+    from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.sensor.simulation import LogSegment
+
 
 def write_csv(table: Table, file: IO[str]) -> None:
     """Write a table as CSV: keys of the columns, then rows; numbers with all their digits, nothing for none."""
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([column.key or column.name for column in table.columns])
+    writer.writerow([column.label for column in table.columns])
     inf = math.inf
     for row in table.rows:
-        # As `_missing` has it; a call for each cell would take longer than writing it.
+        # As `_finite` has it; a call for each cell would take longer than writing it.
         writer.writerow(["" if isinstance(v, float) and not -inf < v < inf else v for v in row])
 
 
@@ -40,29 +39,22 @@ def json_text(record: Any) -> str:
 
 def json_rows(tables: Iterable[Table]) -> list[Any]:
     """Return the rows of tables as records; NaN and inf become None."""
-    return [
-        {key: None if _missing(value) else value for key, value in record.items()}
-        for table in tables
-        for record in table.records()
-    ]
+    return [to_mapping(record) for table in tables for record in table.records()]
 
 
-def _missing(value: Any) -> bool:
-    return value is None or (isinstance(value, float) and not math.isfinite(value))
-
-
-def write_raw(table: Table, path: str) -> None:
-    """Write a table whole or not at all; a missing number is an empty cell or a null.
+def write_table(table: Table, path: str) -> None:
+    """Write a table as CSV, Parquet or JSON by the ending of the name, whole or not at all; a missing number is empty.
 
     Raises:
         OutputError: it cannot be written.
     """
-    if path.endswith(".parquet"):
-        with whole_file(path, binary=True) as file:
+    with whole_file(path, binary=path.endswith(".parquet")) as file:
+        if path.endswith(".parquet"):
             _frame(table).write_parquet(file)
-        return
-    with whole_file(path) as file:
-        write_csv(table, file)
+        elif path.endswith(".json"):
+            file.write(json_text(json_rows([table])))
+        else:
+            write_csv(table, file)
 
 
 def _frame(table: Table) -> polars.DataFrame:
@@ -72,7 +64,7 @@ def _frame(table: Table) -> polars.DataFrame:
     types = {"": polars.String, "d": polars.Int64}
     columns = [
         polars.Series(
-            column.key or column.name,
+            column.label,
             [_finite(row[i]) for row in table.rows],
             dtype=types.get(column.format, polars.Float64),
         )
@@ -85,10 +77,25 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+FORBIDDEN = '/\\:*?"<>|%'
+"""Characters that a file name cannot have on some system, and the one that stands for them."""
+
+
+def write_result(folder: Path, label: str, result: Calibration) -> None:
+    """Write the result file of one sensor, named by its label."""
+    text = json.dumps(result.record(), allow_nan=False, ensure_ascii=False)
+    (folder / f"{file_name(label)}.json").write_text(f"{text}\n", encoding="utf-8", newline="\n")
+
+
+def file_name(label: str) -> str:
+    """Return a label as the name of a file: what a name cannot hold is written as in an address, %2F for a slash."""
+    return "".join(f"%{ord(c):02X}" if c in FORBIDDEN or ord(c) < 32 else c for c in label)
+
+
 DIGITS = "%.9g"
 
 
-def write_log(stretches: Iterable[Stretch], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
+def write_log(stretches: Iterable[LogSegment], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
     """Write the rows as they come; return first and last row of each hold, counted from 1."""
     file.write("t,ax,ay,az" + ",wx,wy,wz" * gyro + "\n")
     holds, row = [], 0

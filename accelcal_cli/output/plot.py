@@ -19,9 +19,10 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.detection.detect import Detection
+from accelcal_cli.navigation.study import BOUND, INS
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.table import Table
-from accelcal_cli.views.navigation import BOUND, INS, Chart
+from accelcal_cli.views.navigation import Chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

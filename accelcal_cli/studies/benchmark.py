@@ -1,19 +1,16 @@
-"""Benchmarks: optimizers on test functions, many runs each.
+"""Benchmarks: optimizers on test functions, many runs each, their statistics and their ranks.
 
-Which optimizer ranks best over several functions, and whether that is more than chance.
-
-Friedman's test on the ranks within each function, then Nemenyi's critical difference of two mean ranks: the
-procedure of [demsar2006].
+Which optimizer ranks best over several functions, and whether that is more than chance: Friedman's test on the ranks
+within each function, then Nemenyi's critical difference of two mean ranks, the procedure of [demsar2006].
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -22,8 +19,17 @@ from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.minimize import Stopping, minimize
 from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.studies.functions import TestFunction
-from accelcal_cli.studies.study import Entry, Record, Study, Task, median_curve, records_of
-from accelcal_cli.table import Column, Table
+from accelcal_cli.studies.study import (
+    Entry,
+    Record,
+    Row,
+    Study,
+    Task,
+    records_of,
+    records_of_cell,
+)
+
+NEEDS = {"residuals": "residuals (a sum of squares)", "closed_form": "a closed form"}
 
 
 @dataclass(frozen=True)
@@ -34,17 +40,17 @@ class Benchmark(Study):
         functions: names of test functions.
         entries: the optimizers.
         dimensions: D.
-        repeats: runs of each cell; seed: of all of them.
+        runs: of each cell; seed: of all of them.
         tolerance: a run succeeds when its cost is at or below this.
-        evaluations: budget of a run; None leaves it to the iterations.
+        evaluations: budget per run; None leaves it to the iterations.
         stop: whether a run ends when it reaches the tolerance.
-        shift, rotate: move the optimum, turn the coordinates.
+        shift, rotate: move the optimum, rotate the coordinates.
     """
 
     functions: tuple[str, ...]
     entries: tuple[Entry, ...]
     dimensions: int = 12
-    repeats: int = 20
+    runs: int = 20
     seed: int = 0
     tolerance: float = 1e-8
     evaluations: int | None = None
@@ -57,18 +63,6 @@ class Benchmark(Study):
         """Pairs of a function and an optimizer that suits it."""
         return len(self.pairs)
 
-    @property
-    def runs(self) -> int:
-        """Runs of each cell."""
-        return self.repeats
-
-    @property
-    def title(self) -> str:
-        """What is run, in one line."""
-        runs = "1 run" if self.repeats == 1 else f"{self.repeats:,} runs"
-        changes = ", shifted" * self.shift + ", rotated" * self.rotate
-        return f"Benchmark: D = {self.dimensions}, {runs}, tolerance {self.tolerance:g}, seed {self.seed}{changes}"
-
     @cached_property
     def pairs(self) -> tuple[tuple[str, Entry], ...]:
         """Function name and optimizer of every cell."""
@@ -79,11 +73,11 @@ class Benchmark(Study):
     @cached_property
     def unsuited(self) -> tuple[tuple[str, str], ...]:
         """Function name and label where the function lacks what the optimizer needs."""
-        built = [(entry.label, entry.build()) for entry in self.entries]
+        optimizers = [(entry.label, entry.build()) for entry in self.entries]
         return tuple(
             (name, label)
             for name in self.functions
-            for label, optimizer in built
+            for label, optimizer in optimizers
             if not optimizer.suits(self.problem(name))
         )
 
@@ -117,10 +111,12 @@ class Benchmark(Study):
         """
         notes = []
         for entry in self.entries:
-            on = [function for function, label in self.unsuited if label == entry.label]
-            if not on:
+            lacking = [function for function, label in self.unsuited if label == entry.label]
+            if not lacking:
                 continue
-            sentence = f"{entry.label} needs {_needs(entry)}, which {_listed(on)} {_lack(on)}"
+            needs = " and ".join(NEEDS.get(need, need) for need in entry.build().needs)
+            do = "does" if len(lacking) == 1 else "do"
+            sentence = f"{entry.label} needs {needs}, which {_listed(lacking)} {do} not have"
             if entry.label in named:
                 raise ConfigError(sentence)
             notes.append(f"{sentence}: left out there")
@@ -130,79 +126,43 @@ class Benchmark(Study):
         return replace(self, entries=tuple(e for e in self.entries if e.label in used)), notes
 
 
-def _needs(entry: Entry) -> str:
-    words = {"residuals": "residuals (a sum of squares)", "closed_form": "a closed form"}
-    return " and ".join(words.get(need, need) for need in entry.build().needs)
-
-
 def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
-def _lack(names: Sequence[str]) -> str:
-    return "does not have" if len(names) == 1 else "do not have"
+def statistics(study: Benchmark, records: Sequence[Record]) -> list[Row]:
+    """Return one row per cell: statistics of the cost over the runs, success rate, evaluations, seconds.
+
+    Definition:
+        evaluations, seconds: medians; evaluations_to_tolerance: median of the runs that reached the tolerance.
+        min, max, mean, variance, median: of the cost; a run without any finite cost counts as infinite.
+        failures: number of runs with a numerical failure.
+    """
+    by_cell = [(study.names(cell), records_of_cell(records, cell)) for cell in range(study.cells)]
+    return [{**names, **_statistics(own)} for names, own in by_cell if own]
 
 
-def summary(study: Benchmark, records: Sequence[Record]) -> Table:
-    """Return one row a cell: statistics of the cost over the runs, success rate, evaluations, seconds."""
-    rows = []
-    for cell in range(study.cells):
-        own = [record for record in records if record.cell == cell]
-        if own:
-            rows.append((*study.names(cell).values(), *_statistics(own)))
-    return Table("Benchmark", COLUMNS, tuple(rows))
-
-
-def _statistics(records: Sequence[Record]) -> tuple[Any, ...]:
-    """Return the numbers of one row; a run without any finite cost counts as infinite."""
+def _statistics(records: Sequence[Record]) -> Row:
     cost = np.array([r.cost for r in records])
     hits = [r.hit for r in records if r.hit is not None]
     several = len(cost) > 1 and bool(np.isfinite(cost).all())
-    return (
-        len(records),
-        int(np.median([r.evaluations for r in records])),
-        float(cost.min()),
-        float(cost.max()),
-        float(cost.mean()),
-        float(cost.var(ddof=1)) if several else None,
-        float(np.median(cost)),
-        len(hits) / len(records),
-        int(np.median(hits)) if hits else None,
-        sum(r.status == Status.FAILED.name.lower() for r in records),
-        float(np.median([r.seconds for r in records])),
-    )
-
-
-COLUMNS = (
-    Column("function"),
-    Column("optimizer"),
-    Column("runs", format=",d"),
-    Column("evaluations", format=",d"),
-    Column("min", format=".3g"),
-    Column("max", format=".3g"),
-    Column("mean", format=".3g"),
-    Column("variance", format=".3g"),
-    Column("median", format=".3g"),
-    Column("success", format=".0%", key="success_rate"),
-    Column("to tolerance", format=",d", key="evaluations_to_tolerance"),
-    Column("failed", format="d", key="failures"),
-    Column("time", "s", ".3f", key="seconds"),
-)
-
-
-def curves(study: Benchmark, records: Sequence[Record]) -> Mapping[str, Mapping[str, tuple[Float, Float]]]:
-    """Return the median convergence (evaluations, cost) by function and optimizer."""
-    found: dict[str, dict[str, tuple[Float, Float]]] = {name: {} for name in study.functions}
-    for cell, (name, entry) in enumerate(study.pairs):
-        curve = median_curve([record for record in records if record.cell == cell])
-        if curve is not None:
-            found[name][entry.label] = curve
-    return found
+    return {
+        "runs": len(records),
+        "evaluations": int(np.median([r.evaluations for r in records])),
+        "min": float(cost.min()),
+        "max": float(cost.max()),
+        "mean": float(cost.mean()),
+        "variance": float(cost.var(ddof=1)) if several else None,
+        "median": float(np.median(cost)),
+        "success_rate": len(hits) / len(records),
+        "evaluations_to_tolerance": int(np.median(hits)) if hits else None,
+        "failures": sum(r.status == Status.FAILED.name.lower() for r in records),
+        "seconds": float(np.median([r.seconds for r in records])),
+    }
 
 
 LEVEL = 0.05
-FEW = 5
-"""Below this many functions the chi-squared distribution is a coarse approximation and the power is small."""
+"""Significance level of the tests."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +174,7 @@ class Ranking:
         functions: N.
         ranks: mean rank of each, 1 is best.
         p: of Nemenyi's test against the first, for each; 1 for the first itself.
-        chi_squared, p_friedman: Friedman's statistic and its p; None with two optimizers, which it needs more of.
+        chi_squared, p_friedman: Friedman's statistic and its p; None with two optimizers, as the test needs three.
         critical: difference of two mean ranks that is significant at LEVEL.
     """
 
@@ -232,12 +192,8 @@ def rank(study: Benchmark, records: Sequence[Record]) -> Ranking | None:
     labels = [e.label for e in study.entries if all(label != e.label for _, label in study.unsuited)]
     if len(labels) < 2 or len(study.functions) < 2:
         return None
-    costs: dict[tuple[str, str], list[float]] = {}
-    for record in records:
-        function, optimizer = study.names(record.cell).values()
-        costs.setdefault((function, optimizer), []).append(record.cost)
-    medians = np.array([[np.median(costs[f, label]) for label in labels] for f in study.functions])
-    return ranking(labels, medians)
+    medians = {(r["function"], r["optimizer"]): r["median"] for r in statistics(study, records)}
+    return ranking(labels, np.array([[medians[f, label] for label in labels] for f in study.functions]))
 
 
 def ranking(labels: Sequence[str], medians: Float) -> Ranking:
@@ -269,39 +225,6 @@ def _friedman(ranks: Float) -> tuple[float, float]:
     from scipy.stats import friedmanchisquare
 
     if (ranks == ranks[:, :1]).all():
-        return 0.0, 1.0  # every function is a tie of all
+        return 0.0, 1.0  # all optimizers tie on every function
     result = friedmanchisquare(*ranks.T)
     return float(result.statistic), float(result.pvalue)
-
-
-def table(result: Ranking) -> Table:
-    """Return the ranking as a table whose notes say what was tested."""
-    columns = (
-        Column("optimizer"),
-        Column("mean rank", format=".2f", key="mean_rank"),
-        Column("p against the best", format=".2g", key="p"),
-    )
-    p = (None, *result.p[1:])
-    return Table(
-        f"Ranks over {result.functions} functions",
-        columns,
-        tuple(zip(result.labels, result.ranks, p, strict=True)),
-        _notes(result),
-    )
-
-
-def _notes(result: Ranking) -> tuple[str, ...]:
-    notes = ["Mean rank by the median cost on each function; 1 is best, ties share."]
-    if result.p_friedman is not None:
-        verdict = "differ" if result.p_friedman < LEVEL else "are not shown to differ"
-        notes.append(
-            f"Friedman test, null hypothesis that all rank alike: chi-squared {result.chi_squared:.3g}, "
-            f"p = {result.p_friedman:.2g}; at the {LEVEL:.0%} level the optimizers {verdict}."
-        )
-    notes.append(
-        f"Nemenyi test of pairs: mean ranks less than {result.critical:.2f} apart do not differ "
-        f"significantly at the {LEVEL:.0%} level."
-    )
-    if result.functions < FEW:
-        notes.append(f"{result.functions} functions are few: such tests then find only large differences.")
-    return tuple(notes)

@@ -1,13 +1,10 @@
-"""Test functions with known minima: those of the papers and the standard ones a reader expects.
+"""Test functions with known minima: those of the papers, and standard ones from the literature.
 
 All have the minimum 0 at a known point. The optimum may be moved off the centre of the box and the coordinates
-rotated about it: an optimizer that only finds the centre, or only moves along the axes, is exposed.
+rotated about it: that exposes an optimizer that only finds the centre, or only moves along the axes.
 
-The formulas of the test functions of z, shape (..., D); each returns costs of shape (...).
-
-Test functions that are sums of squares: their residuals and Jacobians, for least-squares methods.
-
-z has the shape (..., D), residuals (..., M), Jacobians (..., M, D).
+The formulas take z, shape (..., D), and return costs of shape (...). Functions that are sums of squares also have
+residuals, shape (..., M), and Jacobians, shape (..., M, D), for least-squares methods.
 """
 
 from __future__ import annotations
@@ -125,20 +122,16 @@ def styblinski_tang(z: Float) -> Float:
     return least
 
 
-@dataclass(frozen=True)
-class Squares:
-    """Residuals r(z), whose squares sum to the function, and their Jacobian dr/dz."""
-
-    residuals: Callable[[Float], Float]
-    jacobian: Callable[[Float], Float]
-
-
 def _diagonal(z: Float, weights: Float) -> Float:
     """Return a constant diagonal Jacobian for every point."""
     return np.broadcast_to(np.diag(weights), (*z.shape, z.shape[-1])).copy()
 
 
-def _elliptic(z: Float) -> Float:
+def _identity(z: Float) -> Float:
+    return _diagonal(z, np.ones(z.shape[-1]))
+
+
+def _elliptic_roots(z: Float) -> Float:
     root: Float = np.sqrt(elliptic_weights(z.shape[-1]))
     return root
 
@@ -170,7 +163,7 @@ def _zakharov_jacobian(z: Float) -> Float:
     t = z @ slope
     last = np.broadcast_to(slope, z.shape)
     return np.concatenate(
-        [_diagonal(z, np.ones(z.shape[-1])), last[..., None, :], (2.0 * t[..., None] * last)[..., None, :]],
+        [_identity(z), last[..., None, :], (2.0 * t[..., None] * last)[..., None, :]],
         axis=-2,
     )
 
@@ -179,40 +172,49 @@ def _ramp(z: Float) -> Float:
     return 0.5 * np.arange(1.0, z.shape[-1] + 1.0)
 
 
-SPHERE = Squares(lambda z: z, lambda z: _diagonal(z, np.ones(z.shape[-1])))
-ELLIPTIC = Squares(lambda z: z * _elliptic(z), lambda z: _diagonal(z, _elliptic(z)))
-ROSENBROCK = Squares(_valley, _valley_jacobian)
-MODIFIED_ROSENBROCK = Squares(lambda z: _valley(-z), lambda z: -_valley_jacobian(-z))
-ZAKHAROV = Squares(_zakharov, _zakharov_jacobian)
-
-
 MARGIN = 0.1
-"""A moved optimum keeps this part of the half box from the walls."""
+"""A moved optimum stays away from the walls by this part of the half-width of the box."""
 
 
 @dataclass(frozen=True)
 class Definition:
-    """A test function: formula of z, shape (..., D), box of every coordinate, minimiser, start box, squares."""
+    """A test function.
+
+    Attributes:
+        formula: of z, shape (..., D).
+        low, high: box of every coordinate; optimum: each coordinate of the minimiser.
+        start: box of the starting points, where it is not the whole box.
+        residuals, jacobian: r(z), whose squares sum to the function, and dr/dz, of a sum of squares.
+    """
 
     formula: Callable[[Float], Float]
     low: float
     high: float
     optimum: float = 0.0
     start: tuple[float, float] | None = None
-    squares: Squares | None = None
+    residuals: Callable[[Float], Float] | None = None
+    jacobian: Callable[[Float], Float] | None = None
 
 
 FUNCTIONS = {
-    "sphere": Definition(sphere, -100, 100, squares=SPHERE),
-    "rosenbrock": Definition(rosenbrock, -30, 30, 1.0, squares=ROSENBROCK),
+    "sphere": Definition(sphere, -100, 100, residuals=lambda z: z, jacobian=_identity),
+    "rosenbrock": Definition(rosenbrock, -30, 30, 1.0, residuals=_valley, jacobian=_valley_jacobian),
     "rastrigin": Definition(rastrigin, -5.12, 5.12),
     "griewank": Definition(griewank, -600, 600),
-    "modified-rosenbrock": Definition(modified_rosenbrock, -30, 30, -1.0, (-1.0, 1.0), MODIFIED_ROSENBROCK),
+    "modified-rosenbrock": Definition(
+        *(modified_rosenbrock, -30, 30, -1.0, (-1.0, 1.0)),
+        residuals=lambda z: _valley(-z),
+        jacobian=lambda z: -_valley_jacobian(-z),
+    ),
     "ackley": Definition(ackley, -32.768, 32.768),
     "schwefel": Definition(schwefel, -500, 500, SCHWEFEL_POINT),
     "levy": Definition(levy, -10, 10, 1.0),
-    "zakharov": Definition(zakharov, -5, 10, squares=ZAKHAROV),
-    "elliptic": Definition(elliptic, -100, 100, squares=ELLIPTIC),
+    "zakharov": Definition(zakharov, -5, 10, residuals=_zakharov, jacobian=_zakharov_jacobian),
+    "elliptic": Definition(
+        *(elliptic, -100, 100),
+        residuals=lambda z: z * _elliptic_roots(z),
+        jacobian=lambda z: _diagonal(z, _elliptic_roots(z)),
+    ),
     "styblinski-tang": Definition(styblinski_tang, -5, 5, STYBLINSKI_POINT),
 }
 """By name: boxes of the first four from [dpso2014] section 3.1, of the others as usual in the literature."""
@@ -237,14 +239,14 @@ def _unknown(name: str) -> str:
 
 
 class TestFunction(Problem):
-    """A test function over its box, its optimum possibly moved and its coordinates turned.
+    """A test function over its box, with its optimum moved or its coordinates rotated if wanted.
 
     Args:
         name: key of FUNCTIONS.
         dimensions: D >= 2.
         shift: move the optimum to a random place in the box.
-        rotate: turn the coordinates about the optimum by a random rotation.
-        seed: of place and rotation.
+        rotate: rotate the coordinates about the optimum at random.
+        seed: of position and rotation.
 
     Raises:
         ConfigError: no such function.
@@ -256,26 +258,23 @@ class TestFunction(Problem):
     def __init__(
         self, name: str, dimensions: int, *, shift: bool = False, rotate: bool = False, seed: int = 0
     ) -> None:
-        """Draw the place of the optimum and the rotation."""
+        """Draw the position of the optimum and the rotation."""
         if name not in FUNCTIONS:
             raise ConfigError(_unknown(name))
         definition = FUNCTIONS[name]
         self.name, self.definition = name, definition
-        self.lower, self.upper = (
-            np.full(dimensions, float(definition.low)),
-            np.full(dimensions, float(definition.high)),
-        )
+        self.lower, self.upper = np.full((2, dimensions), [[float(definition.low)], [float(definition.high)]])
         if definition.start:
             low, high = definition.start
             self.start = np.full(dimensions, low), np.full(dimensions, high)
         stream = Streams(seed, [0], Purpose.SHIFT)
         centre, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-        place = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions)[0, 0] - 1.0)
-        self.optimum = place if shift else np.full(dimensions, definition.optimum)
+        position = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions)[0, 0] - 1.0)
+        self.optimum = position if shift else np.full(dimensions, definition.optimum)
         self._offset = self.optimum - definition.optimum if shift else None
-        self._turn = np.linalg.qr(stream.normal(dimensions, dimensions)[0])[0] if rotate else None
+        self._rotation = np.linalg.qr(stream.normal(dimensions, dimensions)[0])[0] if rotate else None
 
-        self.has_residuals = definition.squares is not None
+        self.has_residuals = definition.residuals is not None
 
     def cost(self, x: Float) -> Float:
         """Return the function, shape (R, P), at x, shape (R, P, D)."""
@@ -283,23 +282,22 @@ class TestFunction(Problem):
 
     def residuals(self, x: Float) -> Float:
         """Return the residuals whose squares sum to the function; see `Problem.residuals`."""
-        return self._squares().residuals(self._inner(x))
+        if self.definition.residuals is None:
+            raise NotImplementedError(f"{self.name} is not a sum of squares")
+        return self.definition.residuals(self._inner(x))
 
     def jacobian(self, x: Float) -> Float:
         """Return the derivatives of the residuals; see `Problem.jacobian`."""
-        inner = self._squares().jacobian(self._inner(x))
-        return inner if self._turn is None else inner @ self._turn
-
-    def _squares(self) -> Squares:
-        if self.definition.squares is None:
-            raise NotImplementedError(f"{self.name} is no sum of squares")
-        return self.definition.squares
+        if self.definition.jacobian is None:
+            raise NotImplementedError(f"{self.name} is not a sum of squares")
+        inner = self.definition.jacobian(self._inner(x))
+        return inner if self._rotation is None else inner @ self._rotation
 
     def _inner(self, x: Float) -> Float:
-        """Return z, where the formula has its optimum at its own place and its own axes."""
+        """Return z: x in the coordinates of the formula."""
         z = x if self._offset is None else x - self._offset
-        if self._turn is None:
+        if self._rotation is None:
             return z
         away = z - self.definition.optimum
-        turned: Float = (self._turn @ away.swapaxes(1, 2)).swapaxes(1, 2) + self.definition.optimum
+        turned: Float = (self._rotation @ away.swapaxes(1, 2)).swapaxes(1, 2) + self.definition.optimum
         return turned

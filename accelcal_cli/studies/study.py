@@ -1,26 +1,38 @@
-"""What a study is: cells (a problem and an optimizer), runs of each, and the records they leave.
+"""What a study is: cells (a problem and an optimizer), runs of each, and the records that they leave.
 
 A study is plain data, so that it can be hashed, sent to a worker and repeated. A task is a block of runs of one
 cell; its records depend on nothing but the study and the numbers of the runs.
 
-Several studies as one: run, kept and resumed together.
+The optimizers of a study are entries: chosen by name with the shipped settings, or from a file.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.config import load_mapping, shipped_parameters
+from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.minimize import Run
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
-from accelcal_cli.table import Column, Table
+from accelcal_cli.schema import from_mapping
+
+ALL = "all"
+
+Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
+"""Evaluations and median best cost, by function or problem and by optimizer."""
+
+Row = Mapping[str, Any]
+"""A row of statistics: names and numbers by the key of their column."""
 
 TRACE_POINTS = 100
 """Points of a record's convergence curve."""
@@ -34,17 +46,127 @@ class Entry:
     """An optimizer in a study.
 
     Attributes:
-        label: how the tables name it.
-        optimizer: its name; parameters: what differs from its defaults.
+        label: its name in the tables.
+        optimizer: its name; parameters: settings that differ from its defaults.
     """
 
-    label: str
-    optimizer: str
-    parameters: dict[str, Any]
+    label: str = ""
+    optimizer: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
 
     def build(self) -> Optimizer[State]:
         """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
-        return OPTIMIZERS.build(self.optimizer, self.parameters, f"{self.label}")
+        return OPTIMIZERS.build(self.optimizer, self.parameters, self.label)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a study sets for all its optimizers; None leaves each its own.
+
+    Attributes:
+        population: points that are evaluated together.
+        iterations: steps at most.
+        evaluations: per run. Without `iterations`, an optimizer gets as many as this budget allows.
+    """
+
+    population: int | None = None
+    iterations: int | None = None
+    evaluations: int | None = None
+
+    def limit(self, entry: Entry) -> Entry:
+        """Return an optimizer with the population, iterations and evaluations of the study.
+
+        A setting that can have one value only, such as the population of a closed form, stays.
+
+        Raises:
+            ConfigError: a value that the optimizer does not permit.
+        """
+        limits = {f.name: f.metadata for f in dataclasses.fields(OPTIMIZERS.get(entry.optimizer))}
+        stated = {"population": self.population, "iterations": self.iterations}
+        stated = {k: v for k, v in stated.items() if v is not None and limits[k]["low"] != limits[k]["high"]}
+        entry = replace(entry, parameters={**entry.parameters, **stated})
+        population = entry.build().population
+        if self.evaluations is None:
+            return entry
+        more = {}
+        if "evaluations" in limits:
+            more["evaluations"] = max(self.evaluations, int(limits["evaluations"]["low"]))
+        elif self.iterations is None and limits["iterations"]["high"] != 1:
+            more["iterations"] = max(1, -(-self.evaluations // population) - 1)
+        entry = replace(entry, parameters={**entry.parameters, **more})
+        entry.build()
+        return entry
+
+
+def words(values: Iterable[str]) -> list[str]:
+    """Return the names in repeated and comma-separated options, each once, in order."""
+    parts = [part.strip() for value in values for part in value.split(",")]
+    return list(dict.fromkeys(part for part in parts if part))
+
+
+def choose(names: Sequence[str], config: Path | None, default: Sequence[str], budget: Budget) -> list[Entry]:
+    """Return the optimizers that a command line names, with their settings.
+
+    Args:
+        names: labels of the file, names of optimizers, or "all"; none means those of the file, or else `default`.
+        config: YAML file with optimizers and parameters.
+        default: names to take when nothing is stated.
+        budget: replaces the settings of all.
+
+    Raises:
+        ConfigError: an unknown name or setting, or a value out of range.
+    """
+    stated = load_entries(config) if config else {}
+    chosen = list(names) or list(stated) or list(default)
+    if ALL in chosen:
+        others = [name for name in chosen if name != ALL]
+        chosen = list(dict.fromkeys([*stated, *OPTIMIZERS.names(), *others]))
+    return [budget.limit(stated[name] if name in stated else _shipped(name, stated)) for name in chosen]
+
+
+def _shipped(name: str, labels: Iterable[str]) -> Entry:
+    """Return an optimizer with its shipped settings; the labels of a file are named when it is unknown."""
+    try:
+        OPTIMIZERS.get(name)
+    except ConfigError as error:
+        further = f"; labels of the file: {', '.join(labels)}" if labels else ""
+        raise ConfigError(f"{error}{further}") from None
+    return Entry(name, name, shipped_parameters(name))
+
+
+def load_entries(path: Path) -> dict[str, Entry]:
+    """Return the optimizers of a file by label.
+
+    The file holds `optimizers:`, a list of mappings with `optimizer` and optionally `label`, `parameters` and `source`;
+    or just one such mapping, as the shipped files do.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds an unknown key or name, or a label twice.
+    """
+    content = load_mapping(path)
+    listed = content["optimizers"] if set(content) == {"optimizers"} else [content]
+    if not isinstance(listed, list) or not listed:
+        raise ConfigError(f"{path}: optimizers: expected a list of optimizers with their parameters")
+    entries: dict[str, Entry] = {}
+    for number, item in enumerate(listed, 1):
+        where = f"{path}: optimizers[{number}]" if "optimizers" in content else str(path)
+        entry = _entry(item, where)
+        if entry.label in entries:
+            raise ConfigError(f'{where}: label "{entry.label}" is given twice')
+        entries[entry.label] = entry
+    return entries
+
+
+def _entry(item: Any, where: str) -> Entry:
+    if not isinstance(item, Mapping) or "optimizer" not in item:
+        raise ConfigError(f'{where}: expected a mapping with the key "optimizer"')
+    entry = from_mapping(Entry, {key: value for key, value in item.items() if key != "source"}, where)
+    label = entry.label or entry.optimizer
+    if "," in label or label == ALL:
+        raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')
+    parameters = {**shipped_parameters(entry.optimizer), **entry.parameters}
+    OPTIMIZERS.build(entry.optimizer, parameters, where)
+    return Entry(label, entry.optimizer, parameters)
 
 
 @dataclass(frozen=True)
@@ -70,8 +192,8 @@ class Record:
         cost: best cost; evaluations, iterations: used; status: how it ended.
         hit: evaluations when the cost first was at or below the tolerance, or None.
         values: further results of the kind of study (parameter errors, ...), by name.
-        curve: pairs (evaluations, best cost so far), thinned; none beyond the first CURVES runs.
-        seconds: time of the run: its share of its block's.
+        curve: points of evaluations and best cost so far, thinned; none beyond the first CURVES runs.
+        seconds: time of the run: its share of the time of its block.
     """
 
     cell: int
@@ -82,17 +204,22 @@ class Record:
     status: str
     hit: int | None
     values: dict[str, float | None]
-    curve: tuple[tuple[int, float], ...]
+    curve: tuple[tuple[float, ...], ...]
     seconds: float
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Record:
         """Return the record of a journal's line."""
-        return cls(**{**record, "curve": tuple((int(n), float(c)) for n, c in record["curve"])})
+        return cls(**{**record, "curve": tuple(map(tuple, record["curve"]))})
+
+
+def records_of_cell(records: Iterable[Record], cell: int) -> list[Record]:
+    """Return the records of one cell."""
+    return [record for record in records if record.cell == cell]
 
 
 class Study(ABC):
-    """A study; its dataclass fields are all that decides its records."""
+    """A study; its dataclass fields determine its records."""
 
     @property
     @abstractmethod
@@ -106,7 +233,7 @@ class Study(ABC):
 
     @property
     def block(self) -> int:
-        """Runs of one task: the unit that is kept when a study is interrupted, and that a worker gets."""
+        """Runs per task: what a worker gets, and what is kept when a study is interrupted."""
         return 5
 
     @abstractmethod
@@ -119,7 +246,7 @@ class Study(ABC):
 
     @property
     def identity(self) -> str:
-        """Hash of everything that decides the records."""
+        """Hash of everything that determines the records."""
         text = json.dumps([type(self).__name__, asdict(self)], sort_keys=True, default=str)  # type: ignore[call-overload]
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -135,20 +262,20 @@ class Study(ABC):
 def records_of(
     task: Task,
     run: Run,
-    tolerance: float | Float | None,
+    tolerance: float | Float,
     seconds: float,
-    values: Sequence[dict[str, float | None]] | None = None,
+    values: Sequence[dict[str, float | None]] = (),
 ) -> list[Record]:
     """Return the records of a block of runs.
 
     Args:
-        task: whose runs they are.
+        task: that the runs belong to.
         run: what `minimize` returned, with its trace.
-        tolerance: cost that counts as a hit, for all runs or shape (R,); None has no hits.
+        tolerance: cost that counts as a hit, for all runs or shape (R,).
         seconds: time of the block.
         values: further results of each run.
     """
-    limits = np.broadcast_to(np.nan if tolerance is None else tolerance, len(run.runs))
+    limits = np.broadcast_to(tolerance, len(run.runs))
     return [
         Record(
             task.cell,
@@ -166,54 +293,28 @@ def records_of(
     ]
 
 
-def raw_table(study: Study, records: Sequence[Record]) -> Table:
-    """Return one row a run: everything that does not depend on how fast or where it ran.
-
-    Costs and values that are not finite are left for the writer to leave empty.
-    """
-    labels = list(study.names(0))
-    further = list(dict.fromkeys(name for record in records for name in record.values))
-    columns = [
-        *(Column(label) for label in labels),
-        Column("run", format="d"),
-        Column("cost", format=".6g"),
-        Column("evaluations", format="d"),
-        Column("iterations", format="d"),
-        Column("status"),
-        Column("hit", format="d"),
-        *(Column(name, format=".6g") for name in further),
-    ]
-    rows = [
-        (
-            *study.names(r.cell).values(),
-            *(r.run, r.cost, r.evaluations, r.iterations, r.status, r.hit),
-            *(r.values.get(name) for name in further),
-        )
-        for r in records
-    ]
-    return Table("Raw results", tuple(columns), tuple(rows))
-
-
 def _hit(run: Run, i: int, limit: float) -> int | None:
+    """Return the evaluations when the cost of the i-th run first was at or below a limit, or None."""
     if run.trace is None or run.trace_evaluations is None:
         return None
     reached = np.flatnonzero(run.trace[i] <= limit)
     return int(run.trace_evaluations[i][reached[0]]) if len(reached) else None
 
 
-def _curve(run: Run, i: int) -> tuple[tuple[int, float], ...]:
+def _curve(run: Run, i: int) -> tuple[tuple[float, ...], ...]:
+    """Return the thinned trace of the i-th run."""
     if run.trace is None or run.trace_evaluations is None or run.runs[i] >= CURVES:
         return ()
     last = int(run.iterations[i]) + 1
-    keep = sorted({round(k) for k in np.linspace(0, last - 1, min(last, TRACE_POINTS))})
-    counts, costs = run.trace_evaluations[i][keep], run.trace[i][keep]
+    points = sorted({round(k) for k in np.linspace(0, last - 1, min(last, TRACE_POINTS))})
+    counts, costs = run.trace_evaluations[i][points], run.trace[i][points]
     return tuple((int(n), float(c)) for n, c in zip(counts, costs, strict=True) if np.isfinite(c))
 
 
 def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float] | None:
     """Return the median best cost of several runs against evaluations, both of shape (points,).
 
-    From where all runs have a cost to the last evaluation of the longest; one that ended keeps its cost. None
+    From where all runs have a cost to the last evaluation of the longest; a run that ended keeps its cost. None
     when no run left a curve.
     """
     curves = [np.array(record.curve).T for record in records if record.curve]
@@ -224,57 +325,12 @@ def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple
     return grid, np.median(rows, axis=0)
 
 
-@dataclass(frozen=True)
-class Parts(Study):
-    """Studies one after the other; their cells are numbered through.
-
-    Attributes:
-        titles: of the studies; studies: themselves.
-    """
-
-    titles: tuple[str, ...]
-    studies: tuple[Study, ...]
-
-    @property
-    def cells(self) -> int:
-        """Cells of all studies."""
-        return sum(study.cells for study in self.studies)
-
-    @property
-    def runs(self) -> int:
-        """Runs of the study that has most."""
-        return max(study.runs for study in self.studies)
-
-    def names(self, cell: int) -> dict[str, str]:
-        """Return study, function and optimizer of a cell; the function of a calibration is its own word."""
-        part, own = self._locate(cell)
-        names = self.studies[part].names(own)
-        return {"part": self.titles[part], "function": names.get("function", "calibration")} | names
-
-    def tasks(self) -> list[Task]:
-        """Return the tasks of all studies."""
-        return [
-            replace(task, cell=task.cell + first)
-            for study, first in zip(self.studies, self._first(), strict=True)
-            for task in study.tasks()
-        ]
-
-    def execute(self, task: Task) -> list[Record]:
-        """Return the records of a task's runs."""
-        part, own = self._locate(task.cell)
-        return [
-            replace(record, cell=task.cell) for record in self.studies[part].execute(replace(task, cell=own))
-        ]
-
-    def records_of(self, part: int, records: Sequence[Record]) -> list[Record]:
-        """Return the records of one study, its cells numbered as it numbers them."""
-        first, cells = self._first()[part], self.studies[part].cells
-        return [replace(r, cell=r.cell - first) for r in records if first <= r.cell < first + cells]
-
-    def _first(self) -> list[int]:
-        """Return the number of each study's first cell."""
-        return [sum(study.cells for study in self.studies[:part]) for part in range(len(self.studies))]
-
-    def _locate(self, cell: int) -> tuple[int, int]:
-        part = max(p for p, first in enumerate(self._first()) if first <= cell)
-        return part, cell - self._first()[part]
+def median_curves(study: Study, records: Sequence[Record]) -> Curves:
+    """Return the median curve of each cell that left one, by function ("" for a study without) and optimizer."""
+    panels: dict[str, dict[str, tuple[Float, Float]]] = {}
+    for cell in range(study.cells):
+        names, curve = study.names(cell), median_curve(records_of_cell(records, cell))
+        panel = panels.setdefault(names.get("function", ""), {})
+        if curve is not None:
+            panel[names["optimizer"]] = curve
+    return panels

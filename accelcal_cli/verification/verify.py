@@ -24,7 +24,6 @@ from accelcal_cli import __version__
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration import distributions as chances
 from accelcal_cli.calibration import observability as quality
-from accelcal_cli.calibration import result as records
 from accelcal_cli.calibration.assess import is_large, large_residuals, not_fitting, ratio_in_words
 from accelcal_cli.calibration.distributions import Noise, Pair
 from accelcal_cli.calibration.fit import beyond_chance, length_error, leverages, room_of, studentise
@@ -35,6 +34,7 @@ from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import modulus_errors, polish
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
 SCHEMA = "accelcal/verification/1"
@@ -112,8 +112,7 @@ class Verification:
 
     def record(self) -> dict[str, object]:
         """Return plain mappings, lists, numbers and text; NaN becomes None."""
-        plain: dict[str, object] = records.plain(self)
-        return plain
+        return to_mapping(self)
 
 
 def verify(

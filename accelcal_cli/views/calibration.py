@@ -1,19 +1,23 @@
-"""A calibration as tables: what it shows, in the paper's units and in an engineer's.
-
-What a report shows beside the tables of a calibration: the first numbers, and every pose.
-"""
+"""A calibration for people: tables in the paper's units and in an engineer's, its first numbers, every pose."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED, WEAK
+from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, PARAMETERS, SCALE, UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration, Temperature
-from accelcal_cli.planning.plan import KINDS
 from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.poses import AXES
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import BLANK, Block, Conclusion, Convergence, notes
+
+KINDS = (
+    ("scale", SCALE, "ppm", units.PPM),
+    ("misalignment", MISALIGNMENT, "mrad", units.MRAD),
+    ("bias", BIAS, "micro-g", units.MICRO_G),
+)
+"""Kinds of parameters with the unit that their sigma is shown in, and its size in parts of g."""
 
 WORST_SHOWN = 5
 UNKNOWN, ASSUMED = "not determined", "taken as 0"
@@ -30,6 +34,16 @@ def tables(result: Calibration) -> list[Table]:
         observability(result),
         worst_poses(result),
     ]
+
+
+def blocks(result: Calibration) -> list[Block]:
+    """Return what a calibration shows: verdict first, then tables, notes and convergence."""
+    curve: list[Block] = []
+    if len(result.convergence) > 1:
+        title = f"Convergence of {result.optimizer} (best cost L so far, logarithmic)"
+        curve = [Convergence(title, {"": result.convergence})]
+    conclusion = Conclusion(result.verdict, result.reasons, result.cautions)
+    return [conclusion, BLANK, *tables(result), *notes(result.notes), *curve]
 
 
 def parameters(result: Calibration) -> Table:
@@ -175,8 +189,8 @@ def fit(result: Calibration) -> Table:
     if not result.settings.get("polish", True):
         rows.pop(6)
     if result.noise_ratio is not None:
-        rows.insert(3, ("s over scatter within poses", f"{result.noise_ratio:.3g}", ""))
-        rows.insert(4, ("chance of that ratio or more", f"{result.noise_chance:.2g}", ""))
+        rows.insert(3, ("residual noise / noise expected from the readings", f"{result.noise_ratio:.3g}", ""))
+        rows.insert(4, ("p-value", f"{result.noise_chance:.2g}", ""))
     notes = (f"Before: {result.before}.",)
     return Table(
         "Fit", (Column("quantity"), Column("value"), Column("unit", beside=True)), tuple(rows), notes
@@ -193,7 +207,7 @@ def observability(result: Calibration) -> Table:
         word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
         rows.append((name, dop if np.isfinite(dop) else "infinite", word))
     notes = (
-        "Dilution of precision: how many times the noise of one pose the error of a parameter comes out "
+        "Dilution of precision: parameter error divided by the noise of one pose "
         f"(as {result.unit} at 1 g). Above {WEAK:g} weak, above {UNDETERMINED:g} undetermined.",
     )
     columns = (Column("parameter"), Column("DOP", format=".3f"), Column(""))

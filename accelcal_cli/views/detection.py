@@ -3,21 +3,37 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from accelcal_cli.detection.detect import Detection
+from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import Block, notes
 
 SCHEMA = "accelcal/detection/1"
 """Name and version of the record."""
 
 
-def poses_table(found: Detection) -> Table:
-    """Return one row a pose: rows, count, mean, standard deviation, times. `accelcal calibrate` reads it as CSV."""
-    poses = found.intervals
+MOST = 60
+"""Poses that are shown to people; more are in the file of -o."""
+
+
+def blocks(detection: Detection) -> list[Block]:
+    """Return what a detection shows: poses, the thresholds tried, notes."""
+    poses = poses_table(detection)
+    if len(poses.rows) > MOST:
+        note = f"{len(poses.rows) - MOST:,} more poses are not shown; -o writes them all"
+        poses = replace(poses, rows=poses.rows[:MOST], notes=(note,))
+    return [poses, candidates_table(detection), *notes((*detection.notes, detection.summary()))]
+
+
+def poses_table(detection: Detection) -> Table:
+    """Return one row per pose: rows, count, mean, standard deviation, times. `accelcal calibrate` reads it as CSV."""
+    poses = detection.intervals
     columns = [Column("start", key="start", format=","), Column("end", format=","), Column("n", format=",")]
     columns += [Column(f"N{axis}", format=".8g") for axis in "xyz"]
     columns += [Column(f"s{axis}", format=".3g") for axis in "xyz"]
@@ -29,12 +45,12 @@ def poses_table(found: Detection) -> Table:
         values.append(poses.time)
     numbers = np.hstack(values).tolist()
     whole = tuple((*row, *cells) for row, cells in zip(rows, numbers, strict=True))
-    return Table(f"Static poses of {found.source}", tuple(columns), whole)
+    return Table(f"Static poses of {detection.source}", tuple(columns), whole)
 
 
-def candidates_table(found: Detection) -> Table:
+def candidates_table(detection: Detection) -> Table:
     """Return what each multiplier leads to."""
-    unit = "g" if found.settings.g == 1.0 else "m/s^2"
+    unit = "g" if detection.settings.g == 1.0 else "m/s^2"
     columns = (
         Column("multiplier", format="g"),
         Column("threshold", "(output units)^2", ".4g"),
@@ -48,52 +64,41 @@ def candidates_table(found: Detection) -> Table:
     rows = tuple(
         (
             c.multiplier,
-            c.multiplier * found.level.variance,
+            c.multiplier * detection.level.variance,
             c.poses,
             c.attitudes,
             c.rms,
             c.sigma if math.isfinite(c.sigma) else None,
             c.verdict,
-            "kept" if c.multiplier == found.multiplier else "",
+            "kept" if c.multiplier == detection.multiplier else "",
         )
-        for c in found.candidates
+        for c in detection.candidates
     )
-    notes = () if found.settings.g != STANDARD_GRAVITY else (f"at g = {STANDARD_GRAVITY}",)
+    notes = () if detection.settings.g != STANDARD_GRAVITY else (f"at g = {STANDARD_GRAVITY}",)
     return Table("Thresholds tried", columns, rows, notes)
 
 
-def record(found: Detection) -> dict[str, Any]:
+def record(detection: Detection) -> dict[str, Any]:
     """Return the detection as plain mappings, lists, numbers and text; what is not known is None."""
-    rows, level = found.rows, found.level
-    return {
-        "schema": SCHEMA,
-        "data": {"source": found.source, "sha256": found.sha256, "columns": list(found.columns)},
-        "rows": found.log_rows,
-        "rate": found.rate,
-        "window": rows.window,
-        "still": rows.still,
-        "min_length": rows.least,
-        "trim": rows.trim,
-        "variance": level.variance,
-        "quietest": level.quietest,
-        "turning": _finite(level.turning),
-        "multiplier": found.multiplier,
-        "threshold": found.multiplier * level.variance,
-        "candidates": [
-            {
-                "multiplier": c.multiplier,
-                "poses": c.poses,
-                "attitudes": c.attitudes,
-                "rms": _finite(c.rms),
-                "sigma": _finite(c.sigma),
-                "verdict": c.verdict,
-            }
-            for c in found.candidates
-        ],
-        "poses": [dict(pose) for pose in poses_table(found).records()],
-        "notes": [*found.notes, found.summary()],
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    rows, level = detection.rows, detection.level
+    keys = ("multiplier", "poses", "attitudes", "rms", "sigma", "verdict")
+    return to_mapping(
+        {
+            "schema": SCHEMA,
+            "data": {"source": detection.source, "sha256": detection.sha256, "columns": detection.columns},
+            "rows": detection.log_rows,
+            "rate": detection.rate,
+            "window": rows.window,
+            "still": rows.still,
+            "min_length": rows.least,
+            "trim": rows.trim,
+            "variance": level.variance,
+            "quietest": level.quietest,
+            "turning": level.turning,
+            "multiplier": detection.multiplier,
+            "threshold": detection.multiplier * level.variance,
+            "candidates": [{key: getattr(one, key) for key in keys} for one in detection.candidates],
+            "poses": poses_table(detection).records(),
+            "notes": [*detection.notes, detection.summary()],
+        }
+    )

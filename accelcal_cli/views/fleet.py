@@ -11,6 +11,7 @@ from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.fleet import FAILED, Fleet, Quantity, Standout, noise, parameters
 from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import BLANK, Block, Paragraph
 
 SHOWN = 10
 """Sensors of one kind that the summary names."""
@@ -67,6 +68,11 @@ def counts(fleet: Fleet) -> str:
     warned = int((fleet.caution != "").sum())
     beside = f", {warned:,} of them with a caution" if warned else ""
     return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{beside}"
+
+
+def blocks(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: float) -> list[Block]:
+    """Return what a fleet shows: how many sensors of each verdict, then what is worth knowing."""
+    return [Paragraph(heading=counts(fleet)), BLANK, *summary(fleet, labels, found, g)]
 
 
 def summary(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: float) -> list[Table]:

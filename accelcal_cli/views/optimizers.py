@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Mapping
 from typing import Any
 
 from accelcal_cli.config import shipped_parameters
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import BLANK, Block, Paragraph
 
 
 def parameters(name: str) -> dict[str, Any]:
@@ -63,3 +65,54 @@ def _range(limits: Any, hint: Any) -> str:
     if high is not None:
         parts.append(f"<= {high:,}")
     return ", ".join(parts)
+
+
+def catalogue_blocks(table: Table) -> list[Block]:
+    """Return what the catalogue shows: one paragraph per optimizer, with its settings."""
+    blocks: list[Block] = []
+    for record in table.records():
+        needs = f" Needs {record['needs']}." if record["needs"] else ""
+        blocks += [
+            Paragraph(f" - {record['family']}, [{record['paper']}]", heading=record["name"]),
+            Paragraph(record["summary"] + needs, indent=2),
+            Paragraph(assignments(record["parameters"]), indent=2),
+        ]
+    closing = "The settings of one: accelcal optimizers NAME. The papers: docs/bibliography.md."
+    return [*blocks, BLANK, Paragraph(closing)]
+
+
+def settings_blocks(table: Table) -> list[Block]:
+    """Return what the settings of one optimizer show, each with its default, its range and its meaning."""
+    blocks: list[Block] = [Paragraph(heading=table.title)]
+    for name, default, values, meaning in table.rows:
+        limits = f"  ({values})" if values else ""
+        blocks += [Paragraph(f" = {plain(default)}{limits}", heading=name), Paragraph(meaning, indent=2)]
+    return blocks
+
+
+def assignments(parameters: Mapping[str, Any]) -> str:
+    """Return settings as `name=value` with spaces between."""
+    return " ".join(f"{name}={plain(value)}" for name, value in parameters.items())
+
+
+def plain(value: Any) -> str:
+    """Return a setting as YAML has it."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(plain, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def flat(table: Table) -> Table:
+    """Return the table with every cell as text that fits into CSV."""
+    rows = tuple(
+        tuple(
+            assignments(cell) if isinstance(cell, Mapping) else "" if cell == "" else plain(cell)
+            for cell in row
+        )
+        for row in table.rows
+    )
+    return dataclasses.replace(table, rows=rows)

@@ -6,8 +6,15 @@ from accelcal_cli.calibration.observability import MISALIGNMENT, PARAMETERS, SCA
 from accelcal_cli.sensor import model as units
 from accelcal_cli.table import Column, Table
 from accelcal_cli.verification.verify import Difference, Verification
+from accelcal_cli.views.blocks import BLANK, Block, Conclusion
 
 MICRO_RAD = 1000.0 * units.MRAD
+
+
+def blocks(result: Verification) -> list[Block]:
+    """Return what a verification shows: verdict first, then what it rests on."""
+    conclusion = Conclusion(result.verdict, result.reasons, result.cautions)
+    return [conclusion, BLANK, differences(result), evidence(result)]
 
 
 def differences(result: Verification) -> Table:

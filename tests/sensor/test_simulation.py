@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from simulated import DPSO
 
-from accelcal_cli.config import load_mapping, load_sensor, shipped
+from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.schema import build
+from accelcal_cli.schema import from_mapping
 from accelcal_cli.sensor import poses
-from accelcal_cli.sensor.simulation import Sensor, Spread, simulate
+from accelcal_cli.sensor.simulation import Sensor, Spread, load_sensor, simulate
 
 G = 9.8
 SENSOR = Sensor(name="s", K_a=tuple(map(tuple, DPSO.K)), D_a=tuple(DPSO.D))
@@ -102,7 +102,7 @@ def test_every_sensor_of_the_configurations_is_tested():
 )
 def test_a_sensor_that_cannot_be_is_refused(stated, words):
     with pytest.raises(ConfigError, match=words):
-        build(Sensor, stated, "s.yaml")
+        from_mapping(Sensor, stated, "s.yaml")
 
 
 def test_an_unknown_sensor_is_answered():

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from accelcal_cli.calibration.problem import pack
-from accelcal_cli.config import load_sensor
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.sensor.simulation import draw
+from accelcal_cli.sensor.simulation import draw, load_sensor
 from accelcal_cli.studies.compare import Comparison, curves, succeeded, summary
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.scenarios import (

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from accelcal_cli.errors import DataError, OutputError
-from accelcal_cli.output.machine import write_raw
+from accelcal_cli.output.machine import write_table
 from accelcal_cli.studies import engine, pools
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.engine import Journal, run_study
@@ -45,7 +45,7 @@ def expected(tmp_path_factory) -> bytes:
 
 
 def raw(records, folder: Path, name="raw.csv") -> bytes:
-    write_raw(raw_table(STUDY, records), str(folder / name))
+    write_table(raw_table(STUDY, records), str(folder / name))
     return (folder / name).read_bytes()
 
 

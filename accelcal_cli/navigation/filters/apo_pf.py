@@ -1,7 +1,7 @@
-"""APO-PF: artificial physics moves the predicted particles [xie2009], rebuilt from [depf2015] section 1.
+"""APO-PF: artificial physics moves the predicted particles [xie2009], reconstructed from [depf2015] section 1.
 
-The better attract and the worse repel, F_ij = +-G m_i m_j (x_j - x_i). Sorted by fitness the sums over j are cumulative
-sums of m_j and m_j x_j, so that a generation costs N log N and not N^2.
+Better particles attract and worse ones repel, F_ij = +-G m_i m_j (x_j - x_i). Sorted by fitness, the sums over j are
+cumulative sums of m_j and m_j x_j, so that a generation costs N log N instead of N^2.
 """
 
 from __future__ import annotations
@@ -11,14 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.navigation.particle_filter import FILTERS, Evolving, Fitness
+from accelcal_cli.navigation.evolution import EvolvingFilter, Fitness
+from accelcal_cli.navigation.particle_filter import FILTERS
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
 
 @FILTERS.register("apo-pf")
 @dataclass(frozen=True)
-class ApoPf(Evolving):
+class ApoPf(EvolvingFilter):
     """Particle filter with artificial physics optimisation [xie2009]."""
 
     inertia: float = setting(0.6, "w, part of the velocity that is kept", low=0.0, high=1.0)
@@ -48,7 +49,7 @@ def forces(x: Float, fitness: Float) -> Float:
     """Return sum_j F_ij / m_i on each particle, shape (R, N, 2), with G = 1 / sum_j m_j.
 
     Args:
-        x: shape (R, N, 2); fitness: shape (R, N), larger is better; the best feels none.
+        x: shape (R, N, 2); fitness: shape (R, N), larger is better; the force on the best is zero.
     """
     runs, count = fitness.shape
     order = np.argsort(-fitness, axis=1, kind="stable")

@@ -1,13 +1,13 @@
-"""The plain particle filter under its name."""
+"""PF: the plain particle filter."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from accelcal_cli.navigation.particle_filter import FILTERS, Sir
+from accelcal_cli.navigation.particle_filter import FILTERS, ParticleFilter
 
 
 @FILTERS.register("pf")
 @dataclass(frozen=True)
-class Pf(Sir):
+class Pf(ParticleFilter):
     """Sampling-importance-resampling particle filter [gordon1993]."""

@@ -1,4 +1,4 @@
-"""PSO-PF: a Gaussian particle swarm moves the predicted particles [fang2007], rebuilt from [depf2015] section 1."""
+"""PSO-PF: a Gaussian particle swarm moves the particles [fang2007], reconstructed from [depf2015] section 1."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.navigation.particle_filter import FILTERS, Evolving, Fitness
+from accelcal_cli.navigation.evolution import EvolvingFilter, Fitness
+from accelcal_cli.navigation.particle_filter import FILTERS
 from accelcal_cli.rng import Streams
 
 
 @FILTERS.register("pso-pf")
 @dataclass(frozen=True)
-class PsoPf(Evolving):
+class PsoPf(EvolvingFilter):
     """Particle filter with a Gaussian particle swarm, without inertia or velocity limit [fang2007]."""
 
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:

@@ -1,35 +1,35 @@
-"""The reference: a Gaussian sum of extended Kalman filters [alspach1972], which tells what is attainable.
+"""The reference: a Gaussian sum of extended Kalman filters [alspach1972], which shows what is attainable.
 
 The initial square is covered by components, each a Kalman filter of all twelve errors, linearised at its own mean.
-Their weights follow from their innovations; the hopeless are dropped, and those that have come together are one.
+Their weights follow from their innovations; components of negligible weight are dropped, and those that have come
+together are merged.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
-from accelcal_cli.navigation.particle_filter import FILTERS, Filter, Track
+from accelcal_cli.navigation.particle_filter import FILTERS, Filter, PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.rng import Streams
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import setting
 
 CHUNK = 60
-HOPELESS = 1e-6
+NEGLIGIBLE = 1e-6
 """Weight below which a component is dropped."""
 
-TOGETHER = 0.01
+COINCIDENT = 0.01
 """Squared Mahalanobis distance of the positions below which a lighter component is merged into the heaviest."""
 
 
-MEMORY, UNFIT = 30.0, 4.0
-"""A component whose normalised innovation squared, 1 when all is well, is above UNFIT over MEMORY measurements is
-wrong: its covariance grows."""
+MEMORY, MISFIT = 30.0, 4.0
+"""A component whose mean normalised innovation squared over MEMORY measurements, 1 when all is well, exceeds MISFIT
+is wrong: its covariance is inflated."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Bank:
     """All components of all runs, M in all.
 
     Attributes:
-        run: whose they are, shape (M,), ascending.
+        run: which run each belongs to, shape (M,), ascending.
         mean: metric states, shape (M, 12); P: covariances, shape (M, 12, 12).
         log_weight: shape (M,).
         misfit: running mean of the normalised innovation squared, shape (M,).
@@ -59,43 +59,38 @@ class Bank:
 @FILTERS.register("reference")
 @dataclass(frozen=True)
 class Reference(Filter):
-    """Gaussian sum of extended Kalman filters [alspach1972]; it draws no random number."""
+    """Gaussian sum of extended Kalman filters [alspach1972]; it draws no random number, and has one mode."""
 
-    mode: Literal["default", "literal"] = setting("default", "the same filter in either mode")
     components: int = setting(5, "on either axis of the initial square", low=1, high=50)
-    swell: float = setting(
+    recovery_inflation: float = setting(
         4.0,
-        "growth of a component's covariance when its innovations do not fit; 1: none",
+        "of the covariance of a component whose innovations do not fit; 1: none",
         low=1.0,
         high=100.0,
     )
 
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
-
-    def run(self, scenario: Scenario, streams: Streams) -> Track:  # noqa: ARG002
-        """Return the filter's track; see `Filter`."""
-        track = Track.empty(scenario)
+    def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:  # noqa: ARG002
+        """Return the filter's estimates; see `Filter`."""
+        estimates = PositionEstimates.empty(scenario)
         bank = self._start(scenario)
         Q = np.diag(process_noise(scenario.grade, scenario.period))
         used, F = 0, scenario.transitions(0, 0)
         for k in range(scenario.epochs):
             used += len(bank.run)
-            bank, known = _updated(scenario, bank, k)
-            track.blind[:] += np.bincount(bank.run, known, scenario.runs) == 0
-            track.mean[:, k], track.covariance[:, k] = _moments(bank, scenario.runs)
-            bank = _widened(_pruned(bank, scenario.runs), scenario.initial, self.swell)
+            bank, known = _update(scenario, bank, k)
+            estimates.blind[:] += np.bincount(bank.run, known, scenario.runs) == 0
+            estimates.mean[:, k], estimates.covariance[:, k] = _moments(bank, scenario.runs)
+            bank = _inflate(_prune(bank, scenario.runs), scenario.initial, self.recovery_inflation)
             if k % CHUNK == 0:
                 F = scenario.transitions(k, min(k + CHUNK, scenario.epochs))
-                bank = _merged(bank)
+                bank = _merge(bank)
             step = F[bank.run, k % CHUNK]
             mean = (step @ bank.mean[:, :, None])[:, :, 0]
             bank = replace(bank, mean=mean, P=step @ bank.P @ step.swapaxes(1, 2) + Q)
-        return replace(track, lookups=used / (scenario.runs * scenario.epochs))
+        return replace(estimates, lookups=used / (scenario.runs * scenario.epochs))
 
     def _start(self, scenario: Scenario) -> Bank:
-        """Return equal components in the middles of the squares that tile the initial one."""
+        """Return equal components at the centres of the squares that tile the initial one."""
         count = self.components
         width = 2.0 * scenario.initial / count
         middle = (np.arange(count) + 0.5) * width - scenario.initial
@@ -113,7 +108,7 @@ class Reference(Filter):
         )
 
 
-def _updated(scenario: Scenario, bank: Bank, k: int) -> tuple[Bank, Bool]:
+def _update(scenario: Scenario, bank: Bank, k: int) -> tuple[Bank, Bool]:
     """Return the bank after the measurement of epoch k, and which components are on the map."""
     latitude = scenario.ins.latitude[bank.run, k]
     meridian, parallel = metres_per_radian(latitude)
@@ -158,24 +153,24 @@ def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
     return mean, np.stack(parts, axis=1).reshape(runs, 2, 2).astype(float)
 
 
-def _pruned(bank: Bank, runs: int) -> Bank:
-    """Return the bank without hopeless components."""
+def _prune(bank: Bank, runs: int) -> Bank:
+    """Return the bank without components of negligible weight."""
     weight = _weights(bank, runs)
-    keep = ~(weight <= HOPELESS)  # a diverged run has weights that are no numbers, and stays so
+    keep = ~(weight <= NEGLIGIBLE)  # a diverged run has NaN weights, and stays so
     return bank if keep.all() else bank.at(keep)
 
 
-def _widened(bank: Bank, initial: float, swell: float) -> Bank:
-    """Return the bank in which components whose innovations do not fit are wider, to the initial error at most."""
-    wrong = (bank.misfit > UNFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
+def _inflate(bank: Bank, initial: float, inflation: float) -> Bank:
+    """Return the bank with inflated components where innovations do not fit, unless as wide as the initial error."""
+    wrong = (bank.misfit > MISFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
     if not wrong.any():
         return bank
-    P = np.where(wrong[:, None, None], swell * bank.P, bank.P)
+    P = np.where(wrong[:, None, None], inflation * bank.P, bank.P)
     return replace(bank, P=P, misfit=np.where(wrong, 1.0, bank.misfit))
 
 
-def _merged(bank: Bank) -> Bank:
-    """Return the bank in which each run's heaviest component has taken in those at its place."""
+def _merge(bank: Bank) -> Bank:
+    """Return the bank in which the heaviest component of each run has absorbed those that coincide with it."""
     keep = np.ones(len(bank.run), dtype=bool)
     log_weight = bank.log_weight.copy()
     for first, last in _spans(bank.run):
@@ -183,7 +178,7 @@ def _merged(bank: Bank) -> Bank:
         top = first + int(log_weight[own].argmax())
         away = bank.mean[own, :2] - bank.mean[top, :2]
         inverse = np.linalg.inv(bank.P[top, :2, :2])
-        near = ((away @ inverse) * away).sum(axis=1) < TOGETHER
+        near = ((away @ inverse) * away).sum(axis=1) < COINCIDENT
         log_weight[top] = np.logaddexp.reduce(log_weight[own][near])
         keep[own] = ~near
         keep[top] = True

@@ -171,7 +171,7 @@ def test_a_plot_of_costs_that_are_all_zero(run, tmp_path):
         (["--raw", "raw.txt"], "expected a name that ends in .csv or .parquet"),
         (["--plot", "plot.gif"], "expected a name that ends in .png or .svg"),
         (["--plot", "missing/plot.png"], "no such folder"),
-        (["--resume"], "--resume: needs the --raw FILE"),
+        (["--resume"], "--resume needs the --raw FILE"),
         (["--jobs", "2", "--cluster", "tcp://127.0.0.1:9"], "expected one of them, not both"),
         (["--optimizer", "levenberg-marquardt", "--func", "ackley"], "needs residuals"),
         (["--optimizer", "ellipsoid"], "needs a closed form"),

@@ -249,16 +249,16 @@ def test_a_picture_needs_matplotlib(run, log, monkeypatch):
 def test_options_of_a_log_go_with_raw(run, log):
     for arguments in (["--window", "1"], ["--gyro", "none"], ["--min-poses", "3"]):
         outcome = run("calibrate", log, *arguments)
-        assert (outcome.code, outcome.err) == (2, f"accelcal: {arguments[0]}: goes with --raw only\n")
+        assert (outcome.code, outcome.err) == (2, f"accelcal: {arguments[0]} needs --raw\n")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--gyro"], "--gyro: goes with --raw only"),
-        (["--hold", "3"], "--hold: goes with --raw only"),
-        (["--raw", "--samples", "2"], "--samples: does not go with --raw"),
-        (["--raw", "--attitude"], "--attitude: does not go with --raw"),
+        (["--gyro"], "--gyro needs --raw"),
+        (["--hold", "3"], "--hold needs --raw"),
+        (["--raw", "--samples", "2"], "--samples cannot be used with --raw"),
+        (["--raw", "--attitude"], "--attitude cannot be used with --raw"),
         (["--raw", "--rate", "0"], "rate: 0.0 is too small"),
         (["--raw", "--tremor", "nan"], "tremor: nan is not a finite number"),
     ],

@@ -1,4 +1,4 @@
-"""Gaps in the time column: no interval goes across one, and the largest is told."""
+"""Lengths, windows, gaps in the time column, and the envelope of a raw log."""
 
 from __future__ import annotations
 
@@ -11,9 +11,21 @@ from raw_logs import in_blocks, opened, simulated, text
 from accelcal_cli.detection.detect import DetectSettings, TooFewPosesError, detect
 from accelcal_cli.detection.intervals import find_intervals, find_level
 from accelcal_cli.detection.rawlog import Clock
-from accelcal_cli.detection.windows import Gaps, Limit, Rows, Tiles
+from accelcal_cli.detection.windows import (
+    MOST_BINS,
+    Envelope,
+    Gaps,
+    RowLengths,
+    Span,
+    Spans,
+    Tiles,
+    longest_step,
+    parse_span,
+    windows,
+)
+from accelcal_cli.errors import UsageError
 
-ROWS = Rows(tile=10, width=10, still=None, least=100, trim=50)
+ROWS = RowLengths(tile=10, width=10, still=None, least=100, trim=50)
 LOG, HOLDS = simulated(gyro=False)
 START, END = HOLDS[6]
 
@@ -26,8 +38,8 @@ def late(row, seconds):
 
 
 def found(numbers, sizes=(4096,)):
-    tiles = Tiles(ROWS.tile, gyro=False, timed=True, limit=Limit.of(Clock(100.0), ROWS))
-    for raw in in_blocks(numbers, sizes, gyro=False):
+    tiles = Tiles(ROWS.tile, gyro=False, timed=True, longest=longest_step(Clock(100.0), ROWS))
+    for raw in in_blocks(numbers, sizes):
         tiles.add(raw)
     (seen,) = find_intervals(tiles, ROWS, find_level(tiles, ROWS, "log"), (4.0,))
     return seen.intervals, tiles.gaps
@@ -73,10 +85,10 @@ def test_blocks_of_the_store_change_no_gap(monkeypatch):
 
 @pytest.mark.parametrize(("rows", "window", "count"), [(99, 100, 0), (101, 100, 1), (9, 2, 0), (11, 2, 1)])
 def test_a_step_is_a_gap_beyond_a_window_and_ten_periods(rows, window, count):
-    lengths = Rows(tile=max(1, window // 10), width=min(10, window), still=None, least=1, trim=0)
-    gaps = Gaps(Limit.of(Clock(1000.0, "ms"), lengths))
+    lengths = RowLengths(tile=max(1, window // 10), width=min(10, window), still=None, least=1, trim=0)
+    gaps = Gaps(longest_step(Clock(1000.0, "ms"), lengths))
     time = np.array([[0.0, 1.0], [1.0 + rows, 2.0 + rows], [3.0 + rows, 3.0 + 2 * rows]])
-    gaps.see(time)
+    gaps.add(time)
     assert gaps.count == 2 * count
     assert gaps.largest == rows * count
 
@@ -114,3 +126,67 @@ def test_gaps_everywhere_are_told_when_nothing_is_found():
     numbers[1000:, -1] = numbers[1000, -1] + 2000.0 * np.arange(len(LOG) - 1000)
     with pytest.raises(TooFewPosesError, match=r"; the time column has [\d,]+ gaps, the largest of 2 s"):
         detected(numbers)
+
+
+def test_windows_have_the_variance_of_their_rows():
+    log, _ = simulated()
+    tiles = Tiles(10, gyro=True, timed=True)
+    for raw in in_blocks(log[:1500], (4096,)):
+        tiles.add(raw)
+    (block,) = windows(tiles, 10)
+    for k in (0, 7, len(block.variance) - 1):
+        rows = log[10 * k : 10 * k + 100]
+        assert block.variance[k] == pytest.approx(np.linalg.norm(rows[:, :3].var(axis=0)), rel=1e-9)
+        assert block.spread[k] == pytest.approx(rows[:, 3:6].var(axis=0).sum(), rel=1e-9)
+        np.testing.assert_allclose(block.mean[k], rows[:, :3].mean(axis=0), rtol=1e-12)
+    (sparse,) = windows(tiles, 10, step=3)
+    np.testing.assert_array_equal(sparse.variance, block.variance[::3])
+
+
+def test_an_envelope_stays_small_and_loses_no_peak():
+    envelope, rows = Envelope(1), 5 * MOST_BINS + 77
+    values = np.sin(np.arange(rows * 3.0).reshape(rows, 3))
+    values[12_345] = 9.0
+    for first in range(0, rows, 1000):
+        part = values[first : first + 1000]
+        envelope.add(part.T[:, :, None].copy(), None)
+    at, low, high = envelope.bins()
+    assert len(at) <= MOST_BINS + 1
+    width = int(at[1])
+    for k in (0, 5, len(at) - 1):
+        part = values[k * width : (k + 1) * width]
+        np.testing.assert_array_equal(low[k], part.min(axis=0))
+        np.testing.assert_array_equal(high[k], part.max(axis=0))
+    assert high[12_345 // width].max() == 9.0
+
+
+@pytest.mark.parametrize(
+    ("text", "span"),
+    [
+        ("1", Span(1)),
+        ("1.5s", Span(1.5)),
+        ("2 sec", Span(2)),
+        ("101rows", Span(101, True)),
+        ("5 samples", Span(5, True)),
+    ],
+)
+def test_spans_are_seconds_or_rows(text, span):
+    assert parse_span(text, "--window") == span
+
+
+@pytest.mark.parametrize("text", ["", "x", "-1", "nan", "inf", "1.5rows", "1 minute"])
+def test_other_spans_are_refused(text):
+    with pytest.raises(UsageError, match="--window"):
+        parse_span(text, "--window")
+
+
+def test_lengths_come_from_the_rate_or_from_rows():
+    assert Spans().rows(None) == RowLengths(10, 10, None, 100, 50)
+    assert Spans().rows(200.0) == RowLengths(20, 10, None, 200, 100)
+    assert Spans(window=Span(7, True), trim=Span(0)).rows(100.0) == RowLengths(1, 7, None, 100, 0)
+    with pytest.raises(UsageError, match="state --rate"):
+        Spans(still=Span(5)).rows(None)
+    with pytest.raises(UsageError, match="too few to have a variance"):
+        Spans(window=Span(0.001)).rows(100.0)
+    with pytest.raises(UsageError, match="fewer than the 100 of a window"):
+        Spans(still=Span(50, True)).rows(100.0)

@@ -14,9 +14,9 @@ A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]
 
 
 def read(log):
-    parts = [(raw.numbers, raw.time) for raw in log.blocks()]
+    rows = np.concatenate(list(log.blocks()))
     log.close()
-    return np.concatenate([numbers for numbers, _ in parts])
+    return rows
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_dates_with_a_decimal_comma():
 def test_a_date_that_is_none_is_named(wrong, late):
     lines = with_dates(str).split(b"\n")
     lines[late] = wrong.encode() + lines[late][lines[late].index(b",") :]
-    with pytest.raises(DataError, match=f'line {late + 1}, column "time": ".*" is no time; .*--time none'):
+    with pytest.raises(DataError, match=f'line {late + 1}, column "time": ".*" is not a time; .*--time none'):
         read(opened(b"\n".join(lines)))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from accelcal_cli.config import load_result
+from accelcal_cli.calibration.result import load_result
 
 
 @pytest.fixture
@@ -253,7 +253,7 @@ def test_a_temperature_column_is_not_used_and_that_is_said(run, table):
     Path("warm.csv").write_text("\n".join(warm))
     plain, told = (run("fleet", name, "--format", "csv") for name in (table, "warm.csv"))
     assert told.out == plain.out
-    note = "Temperature column not used: slopes with temperature go sensor by sensor, with calibrate."
+    note = "Temperature column not used: calibrate fits slopes with temperature, one sensor at a time."
     assert note not in plain.err
     assert f"accelcal: {note}\n" in told.err
 

@@ -14,14 +14,14 @@ from accelcal_cli.calibration.observability import attitudes
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import shared_variance, state
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.config import load_sensor
-from accelcal_cli.detection.detect import MULTIPLIERS, TIE, Candidate, DetectSettings, best, detect
+from accelcal_cli.detection.detect import MULTIPLIERS, TIE, CandidateThreshold, DetectSettings, best, detect
 from accelcal_cli.detection.rawlog import open_raw_log
 from accelcal_cli.detection.windows import Span, Spans
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.sensor.poses import fibonacci
+from accelcal_cli.sensor.simulation import load_sensor
 
 XSENS = ErrorModel(
     np.array([[414.441645, 0, 0], [1.477289, 412.122680, 0], [3.832964, 8.841874, 414.507889]]),
@@ -269,7 +269,10 @@ def test_auto_weights_come_near_the_better_of_the_others(shared):
 
 
 def test_of_candidates_as_good_the_stillest_is_kept():
-    found = [Candidate(m, 20, 20, 0.01, sigma, "good") for m, sigma in ((5.0, 1.0), (3.0, 1.04), (2.0, 1.06))]
+    found = [
+        CandidateThreshold(m, 20, 20, 0.01, sigma, "good")
+        for m, sigma in ((5.0, 1.0), (3.0, 1.04), (2.0, 1.06))
+    ]
     assert best([0, 1, 2], found) == 1
     assert best([0, 2], found) == 0
 

@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from accelcal_cli.config import load_result
+from accelcal_cli.calibration.result import load_result
 
 G = "9.80665"
 
@@ -239,7 +239,7 @@ def test_a_temperature_column_is_used(run, tmp_path):
     np.savetxt("cold.csv", rows, delimiter=",", header="Nx,Ny,Nz", comments="")
     assert "no temperature column" in run("apply", "warm.yaml", "cold.csv").err
     warned = run("export", "warm.yaml", "--to", "c-header")
-    assert "slopes with temperature are dropped" in warned.err
+    assert "temperature slopes are dropped" in warned.err
 
 
 def test_known_attitudes_on_the_command_line(run):
@@ -344,22 +344,31 @@ VERIFY = {
 
 EXPORT = {
     "no format": (["result.yaml"], ["--to"]),
-    "unknown format": (["result.yaml", "--to", "px44"], ['--to "px44"', 'did you mean "px4"', "c-header"]),
+    "unknown format": (
+        ["result.yaml", "--to", "px44"],
+        ['export format "px44"', 'did you mean "px4"', "c-header"],
+    ),
     "counts": (["result.yaml", "--to", "px4"], ["--to px4", "output units", "--driver-scale"]),
-    "driver scale": (["result.yaml", "--to", "px4", "--driver-scale", "0"], ["--driver-scale 0", "positive"]),
+    "driver scale": (
+        ["result.yaml", "--to", "px4", "--driver-scale", "0"],
+        ["--to px4: driver_scale: 0", "more than 0"],
+    ),
     "instance": (
         ["result.yaml", "--to", "px4", "--instance", "9", "--driver-scale", "1"],
-        ["--instance 9", "0 to 3"],
+        ["--to px4: instance: 9", "at most 3"],
     ),
     "driver scale of ros": (
         ["result.yaml", "--to", "ros", "--driver-scale", "2"],
-        ["--driver-scale: --to ros has no use for it", "px4, ardupilot, kalibr"],
+        ["--driver-scale does not apply to --to ros", "ardupilot, kalibr, px4"],
     ),
     "instance of numpy": (
         ["result.yaml", "--to", "numpy", "--instance", "0", "-o", "a.npz"],
-        ["--instance: --to numpy has no use for it"],
+        ["--instance does not apply to --to numpy"],
     ),
-    "negative instance": (["result.yaml", "--to", "px4", "--instance", "-1"], ["--instance", "-1"]),
+    "negative instance": (
+        ["result.yaml", "--to", "px4", "--instance", "-1"],
+        ["--to px4: instance: -1", "at least 0"],
+    ),
     "no folder": (["result.yaml", "--to", "ros", "-o", "no/out.yaml"], ["no/out.yaml", "no such folder"]),
 }
 

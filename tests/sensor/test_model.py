@@ -1,4 +1,4 @@
-"""The error model and the gauges of its matrix."""
+"""The error model, the gauges of its matrix, and engineering units."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from simulated import DPSO, direct_cost, noise, rotation
 
 from accelcal_cli.rng import Streams
+from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import GAUGES, ErrorModel, to_gauge
 
@@ -122,3 +123,30 @@ def test_a_matrix_that_is_all_but_singular_has_its_gauges(gauge):
     np.testing.assert_array_equal(found[0], to_gauge(K, gauge))
     np.testing.assert_array_equal(found[1], np.eye(3))
     np.testing.assert_allclose(found[2] @ found[2].T, np.diag([1.0, 0.0, 4.0]))
+
+
+# Engineering units
+
+
+def test_engineering_units():
+    assert units.STANDARD_GRAVITY == 9.80665
+    assert pytest.approx(206264.806247, rel=1e-12) == units.ARCSEC
+    assert (units.PPM, units.MRAD, units.MICRO_G) == (1e6, 1e3, 1e6)
+
+
+def test_scale_misalignment_and_bias():
+    K = np.array([[102.0, 0.51, -1.02], [0.98, 98.0, 0.0], [0.0, 2.0, 100.0]])
+    np.testing.assert_allclose(units.scale_error(K, np.full(3, 100.0)), [0.02, -0.02, 0.0], atol=1e-15)
+    angles = units.misalignment(K)
+    np.testing.assert_allclose(angles, [[0, 0.005, -0.01], [0.01, 0, 0], [0, 0.02, 0]], atol=1e-15)
+    np.testing.assert_allclose(units.bias_force(K, np.array([204.0, -49.0, 10.0])), [2.0, -0.5, 0.1])
+    assert K[0, 0] == 102.0
+
+
+@given(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
+def test_the_sum_of_two_misalignments_is_the_angle_that_axes_miss(first, second):
+    """Sensor axes x and y meet at 90 degrees less K_12/K_11 + K_21/K_22, to first order, whatever the gauge."""
+    K = np.diag([3.0, 5.0, 4.0]) @ np.array([[1.0, first, 0.0], [second, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    angles = units.misalignment(K)
+    x, y = K[0] / np.linalg.norm(K[0]), K[1] / np.linalg.norm(K[1])
+    assert angles[0, 1] + angles[1, 0] == pytest.approx(np.pi / 2 - np.arccos(x @ y), abs=3e-5)

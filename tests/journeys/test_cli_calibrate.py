@@ -244,7 +244,7 @@ def test_readings_in_g_that_are_compared_with_metres_are_told(run, good):
     parts = [",".join(repr(float(cell) / 16384) for cell in row) for row in rows[1:]]
     Path("g.csv").write_text("\n".join([",".join(rows[0]), *parts]))
     fast = ("--optimizer", "ellipsoid")
-    assert "go with --g 1" in run("calibrate", "g.csv", *fast).err
+    assert "add --g 1" in run("calibrate", "g.csv", *fast).err
     assert run("calibrate", "g.csv", "--g", "1", *fast).err == ""
     assert "--g 1" not in run("calibrate", good, *fast).err
 

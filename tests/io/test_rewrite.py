@@ -12,10 +12,9 @@ import pytest
 from accelcal_cli.errors import DataError
 from accelcal_cli.io import rewrite as module
 from accelcal_cli.io.columns import choose
-from accelcal_cli.io.reader import TextTable, open_table
+from accelcal_cli.io.reader import Selection, TextTable, open_table
 from accelcal_cli.io.rewrite import Change, rewrite
 from accelcal_cli.io.stream import ByteSource
-from accelcal_cli.io.text import Selection
 
 
 def third(numbers):
@@ -123,7 +122,7 @@ def test_both_writers_read_back_to_the_same_numbers(monkeypatch):
 
 
 def test_polars_is_used_for_plain_blocks(monkeypatch):
-    monkeypatch.setattr(module._Lines, "_careful", lambda self, block, values: pytest.fail("not needed"))
+    monkeypatch.setattr(module._LineWriter, "_careful", lambda self, block, values: pytest.fail("not needed"))
     monkeypatch.setattr(module, "SMALL", 0)
     text = body(60).encode()
     assert run(text, wanted=["2", "3", "4"], small=False, monkeypatch=monkeypatch).count(b"\n") == 60

@@ -140,7 +140,10 @@ CALIBRATE = {
     "box key": (["good.csv", "--config", "box-key.yaml"], ['"scales"', 'did you mean "scale"']),
     "nominal": (["good.csv", "--config", "nominal.yaml"], ["nominal: scale", "expected 3 values, not 2"]),
     "nominal zero": (["good.csv", "--config", "nominal-zero.yaml"], ["nominal", "positive"]),
-    "nominal inf": (["good.csv", "--config", "nominal-inf.yaml"], ["nominal: scale", "not finite"]),
+    "nominal inf": (
+        ["good.csv", "--config", "nominal-inf.yaml"],
+        ["nominal: scale[2]", "not a finite number"],
+    ),
     "nominal large": (["good.csv", "--config", "nominal-large.yaml"], ["nominal", "1e+30"]),
     "g in YAML": (["good.csv", "--config", "g.yaml"], ["g.yaml: g: -9.8", "at least"]),
     "nan g in YAML": (["good.csv", "--config", "g-nan.yaml"], ["g-nan.yaml: g", "not a finite number"]),

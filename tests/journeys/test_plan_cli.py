@@ -134,7 +134,7 @@ def test_faces_alone_exit_with_1(run):
         (("--poses", "12", "--add", "3"), "--poses and --add: expected one of them"),
         (("--noise", "-1"), "--noise -1: expected a positive number"),
         (("--noise", "nan"), "--noise nan: expected a positive number"),
-        (("six.csv", "--poses", "6"), "--poses 6: 6 poses are there already"),
+        (("six.csv", "--poses", "6"), "--poses 6: 6 poses exist already"),
         (("nowhere.csv",), "nowhere.csv"),
         (("nowhere.yaml",), "nowhere.yaml"),
         (("six.csv", "--columns", "a,b,c"), "six.csv"),

@@ -10,16 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raw_logs import in_blocks, simulated
 
-from accelcal_cli.detection.intervals import Intervals, find_intervals, find_level, merge, windows
-from accelcal_cli.detection.windows import MOST, Envelope, Rows, Span, Spans, Tiles, parse_span
-from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.detection.intervals import Intervals, find_intervals, find_level, merge
+from accelcal_cli.detection.windows import Envelope, RowLengths, Tiles
+from accelcal_cli.errors import DataError
 
-ROWS = Rows(tile=10, width=10, still=None, least=100, trim=50)
+ROWS = RowLengths(tile=10, width=10, still=None, least=100, trim=50)
 
 
 def tiled(numbers, sizes=(4096,), *, gyro=True, timed=True, size=10, envelope=None):
     tiles = Tiles(size, gyro, timed)
-    for raw in in_blocks(numbers, sizes, gyro=gyro, timed=timed):
+    for raw in in_blocks(numbers, sizes):
         tiles.add(raw, envelope)
     return tiles
 
@@ -77,18 +77,6 @@ def test_a_large_offset_cancels_nothing():
     plain, far = found(tiled(LOG))[0].intervals, found(tiled(shifted))[0].intervals
     np.testing.assert_array_equal(plain.start, far.start)
     np.testing.assert_allclose(far.scatter, plain.scatter, rtol=1e-6)
-
-
-def test_windows_have_the_variance_of_their_rows():
-    tiles = tiled(LOG[:1500])
-    (block,) = windows(tiles, 10)
-    for k in (0, 7, len(block.variance) - 1):
-        rows = LOG[10 * k : 10 * k + 100]
-        assert block.variance[k] == pytest.approx(np.linalg.norm(rows[:, :3].var(axis=0)), rel=1e-9)
-        assert block.spread[k] == pytest.approx(rows[:, 3:6].var(axis=0).sum(), rel=1e-9)
-        np.testing.assert_allclose(block.mean[k], rows[:, :3].mean(axis=0), rtol=1e-12)
-    (sparse,) = windows(tiles, 10, step=3)
-    np.testing.assert_array_equal(sparse.variance, block.variance[::3])
 
 
 def test_several_multipliers_agree_with_each_alone():
@@ -212,52 +200,3 @@ def test_merging_takes_rows_together():
     np.testing.assert_allclose(joined.mean, [mean, poses.mean[2]], rtol=1e-12)
     pooled = ((poses.n[[1, 3], None] - 1) * poses.scatter[[1, 3]] ** 2).sum(axis=0) / (joined.n[0] - 2)
     np.testing.assert_allclose(joined.scatter[0], np.sqrt(pooled), rtol=1e-12)
-
-
-def test_an_envelope_stays_small_and_loses_no_peak():
-    envelope, rows = Envelope(1), 5 * MOST + 77
-    values = np.sin(np.arange(rows * 3.0).reshape(rows, 3))
-    values[12_345] = 9.0
-    for first in range(0, rows, 1000):
-        part = values[first : first + 1000]
-        envelope.add(part.T[:, :, None].copy(), None)
-    at, low, high = envelope.bins()
-    assert len(at) <= MOST + 1
-    width = int(at[1])
-    for k in (0, 5, len(at) - 1):
-        part = values[k * width : (k + 1) * width]
-        np.testing.assert_array_equal(low[k], part.min(axis=0))
-        np.testing.assert_array_equal(high[k], part.max(axis=0))
-    assert high[12_345 // width].max() == 9.0
-
-
-@pytest.mark.parametrize(
-    ("text", "span"),
-    [
-        ("1", Span(1)),
-        ("1.5s", Span(1.5)),
-        ("2 sec", Span(2)),
-        ("101rows", Span(101, True)),
-        ("5 samples", Span(5, True)),
-    ],
-)
-def test_spans_are_seconds_or_rows(text, span):
-    assert parse_span(text, "--window") == span
-
-
-@pytest.mark.parametrize("text", ["", "x", "-1", "nan", "inf", "1.5rows", "1 minute"])
-def test_other_spans_are_refused(text):
-    with pytest.raises(UsageError, match="--window"):
-        parse_span(text, "--window")
-
-
-def test_lengths_come_from_the_rate_or_from_rows():
-    assert Spans().rows(None) == Rows(10, 10, None, 100, 50)
-    assert Spans().rows(200.0) == Rows(20, 10, None, 200, 100)
-    assert Spans(window=Span(7, True), trim=Span(0)).rows(100.0) == Rows(1, 7, None, 100, 0)
-    with pytest.raises(UsageError, match="state --rate"):
-        Spans(still=Span(5)).rows(None)
-    with pytest.raises(UsageError, match="too few to have a variance"):
-        Spans(window=Span(0.001)).rows(100.0)
-    with pytest.raises(UsageError, match="fewer than the 100 of a window"):
-        Spans(still=Span(50, True)).rows(100.0)

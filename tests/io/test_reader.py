@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import Dialect
+from accelcal_cli.io.reader import CarefulParser, FastParser, Selection
 from accelcal_cli.io.stream import ByteSource
-from accelcal_cli.io.text import CarefulParser, FastParser, Selection
 
 ODD_CELLS = [
     "", " ", "nan", "NaN", "inf", "-inf", "1e999", "1e101", "-1e100", "abc", "1_000", "0x10", "1.5.2", "+",

@@ -1,9 +1,8 @@
-"""Guided capture: lines to numbers, a stream to poses, and the command over a pseudo-terminal."""
+"""Guided capture: a stream to poses, and the command over a pseudo-terminal."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import pty
 import signal
@@ -17,10 +16,10 @@ import numpy as np
 import pytest
 from simulated import MEMS
 
-from accelcal_cli.detection.capture import Capture, rough_sensor
+from accelcal_cli.detection.capture import Capture, fit_rough_sensor
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.readings import read_readings
-from accelcal_cli.io.serial import file_lines, numbers, pick, port_lines, readings
+from accelcal_cli.io.serial import port_lines
 from accelcal_cli.planning.design import candidates, distinct_poses
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
@@ -64,48 +63,11 @@ def take(stream, capture):
     return states
 
 
-# Lines
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("1 2 3", [1, 2, 3]),
-        ("-1.5,+2e-3;\t.5", [-1.5, 0.002, 0.5]),
-        ("acc: x=0.1 y=-0.2 z=9.8 (m/s^2)", [0.1, -0.2, 9.8]),
-        ('{"t": 12, "a": [1, 2, 3]}', [12, 1, 2, 3]),
-        ("ax1 2 3 4", [2, 3, 4]),
-        ("nothing here", []),
-        ("", []),
-    ],
-)
-def test_numbers_of_a_line(line, expected):
-    assert numbers(line) == expected
-
-
-def test_columns_are_picked_and_what_is_not_finite_is_not_taken():
-    np.testing.assert_array_equal(pick("9 8 7 6", [3, 0, 1]), [6, 9, 8])
-    assert pick("9 8", [0, 1, 2]) is None
-    assert pick("9 nan 7", [0, 1, 2]) is None
-    assert pick("9 inf 7", [0, 1, 2]) is None
-
-
-def test_headers_and_comments_are_passed_over():
-    file = io.BytesIO(b"# a log\nax,ay,az\n1,2,3\n\n\xff\xfe 4,5\n4,5,6\r\n7,8,9")
-    found = list(readings(file_lines(file), [0, 1, 2], "log"))
-    np.testing.assert_array_equal(found, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
-
-
-def test_a_stream_of_something_else_is_refused():
-    with pytest.raises(DataError, match=r'log: 100 lines in a row without 4 numbers, as "1 2 3"'):
-        list(readings([b"1 2 3"] * 200, [1, 2, 3], "log"))
-
-
 # The rough sensor
 
 
 def test_the_rough_sensor_of_one_pose_is_centred():
-    rough = rough_sensor(np.array([[0.0, 0.0, 5.0]]), None, None)
+    rough = fit_rough_sensor(np.array([[0.0, 0.0, 5.0]]), None, None)
     np.testing.assert_allclose(rough.centre, 0.0, atol=1e-12)
     assert rough.scale == pytest.approx(5.0)
 
@@ -113,13 +75,13 @@ def test_the_rough_sensor_of_one_pose_is_centred():
 @pytest.mark.parametrize("bias", [[0, 0, 0], [0.4, -0.8, 0.3], [512, 512, 512]])
 def test_the_rough_sensor_finds_the_sphere(bias):
     outputs = 100.0 * PLANNED + np.array(bias)
-    rough = rough_sensor(outputs, None, None)
+    rough = fit_rough_sensor(outputs, None, None)
     np.testing.assert_allclose(rough.centre, bias, atol=1.0)
     assert rough.scale == pytest.approx(100.0, rel=0.01)
 
 
 def test_what_is_stated_is_kept():
-    rough = rough_sensor(100.0 * PLANNED + 7.0, 50.0, np.full(3, 7.0))
+    rough = fit_rough_sensor(100.0 * PLANNED + 7.0, 50.0, np.full(3, 7.0))
     assert rough.scale == 50.0
     np.testing.assert_array_equal(rough.centre, [7.0] * 3)
     np.testing.assert_allclose(rough.directions(100.0 * PLANNED + 7.0), PLANNED)
@@ -139,7 +101,7 @@ def test_every_pose_that_is_held_is_taken_once():
 def test_a_pose_is_the_mean_of_its_readings():
     capture = Capture(PLANNED, window=30, hold=80)
     take(hand(PLANNED, sigma=0.02), capture)
-    for pose, direction in zip(capture.taken, PLANNED, strict=True):
+    for pose, direction in zip(capture.poses, PLANNED, strict=True):
         assert pose.n == 80
         np.testing.assert_allclose(pose.mean, MEMS.output(G * direction), atol=5 * 0.02 / np.sqrt(80))
         np.testing.assert_allclose(pose.spread, 0.02, rtol=0.4)

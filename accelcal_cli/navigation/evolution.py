@@ -1,0 +1,177 @@
+"""Particle filters whose particles an evolution moves, and where the evolution enters the update [depf2015] section 6.
+
+A filter says how its particles move (`EvolvingFilter.evolve`); a strategy says which of them move, when, and what is
+the fitness.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.navigation.particle_filter import BLIND, Cloud, ParticleFilter, moments, normalise
+from accelcal_cli.navigation.scenario import Scenario
+from accelcal_cli.rng import Streams
+from accelcal_cli.schema import setting
+
+Fitness = Callable[[Float], Float]
+"""Logarithm of the fitness, shape (R, n), of positions, shape (R, n, 2)."""
+
+GATE = 3.0
+"""Evolved particles stay within so many sigma of the predicted cloud [chosen]."""
+
+
+class CountedFitness:
+    """A fitness that counts the points at which it is evaluated.
+
+    Attributes:
+        points: of all runs together.
+    """
+
+    def __init__(self, fitness: Fitness) -> None:
+        """Start at zero."""
+        self.fitness, self.points = fitness, 0
+
+    def __call__(self, position: Float) -> Float:
+        """Return the fitness of positions, shape (R, n, 2)."""
+        self.points += position.shape[0] * position.shape[1]
+        return self.fitness(position)
+
+
+@dataclass(frozen=True)
+class EvolvingFilter(ParticleFilter):
+    """A particle filter whose predicted particles are moved by an evolution.
+
+    Mode `literal` moves all particles at every epoch, by the likelihood alone, as the paper prints it. In mode
+    `default` only the worst fifth moves, only when the weights degenerate, and the fitness is the posterior: the
+    likelihood times the Gaussian of the predicted cloud, within three sigma.
+    """
+
+    generations: int = setting(20, "of the evolution per epoch", low=0, high=1000)
+    fraction: float = setting(0.2, "part of the particles that moves in mode default", above=0.0, high=1.0)
+
+    @abstractmethod
+    def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
+        """Return particles of which the first `movers` have moved.
+
+        Args:
+            x: positions, shape (R, N, 2), worst first in mode default.
+            fitness: shape (R, N).
+            movers: n, how many may move; rate: fitness of positions, shape (R, n, 2).
+        """
+
+    @property
+    def evolution(self) -> Evolution:
+        """The strategy that the settings select."""
+        return evolve_all if self.mode == "literal" else evolve_degenerate
+
+    def update(self, scenario: Scenario, cloud: Cloud, k: int, streams: Streams) -> tuple[Cloud, float, Bool]:
+        """Return the cloud evolved and weighed; see `ParticleFilter.update`."""
+        if not self.generations:
+            return super().update(scenario, cloud, k, streams)
+        return self.evolution(self, scenario, cloud, k, streams)
+
+
+Evolution = Callable[[EvolvingFilter, Scenario, Cloud, int, Streams], tuple[Cloud, float, Bool]]
+"""A strategy: which particles of a filter move at an epoch, and toward what; see `ParticleFilter.update`."""
+
+Move = Callable[[EvolvingFilter, Scenario, Cloud, Float, Streams], tuple[Cloud, int]]
+"""How the runs of a weighed cloud move; see `move_worst`."""
+
+
+def evolve_all(
+    form: EvolvingFilter, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
+) -> tuple[Cloud, float, Bool]:
+    """As printed: all particles move at every epoch, toward the likelihood alone, and are then weighed."""
+    rate = CountedFitness(lambda position: form.likelihood(scenario, k, position))
+    x = cloud.x.copy()
+    fitness = rate(x)
+    x[..., :2] = form.evolve(x[..., :2], fitness, form.particles, rate, streams)
+    weighed = Cloud(x, cloud.log_weights + rate(x))
+    return weighed, rate.points / scenario.runs, fitness.max(axis=1) > BLIND
+
+
+def move_worst(
+    form: EvolvingFilter, recent: Scenario, cloud: Cloud, prior: Float, streams: Streams
+) -> tuple[Cloud, int]:
+    """Move the worst particles toward the posterior, within three sigma; their old weight becomes the mean one.
+
+    Args:
+        form: the filter.
+        recent: the measurements that the fitness looks at; the last one is that of the epoch.
+        cloud: weighed particles; prior: their weights as predicted, shape (R, N).
+        streams: of the runs.
+
+    Returns:
+        The cloud moved, and the look-ups of all its runs.
+    """
+    mean, covariance = moments(prior, cloud.x[..., :2])
+    scale = np.sqrt(np.einsum("rii->ri", covariance)) + 1e-9
+    fitness = posterior(form, recent, mean, covariance)
+
+    def gated(position: Float) -> Float:
+        inside = (np.abs(position - mean[:, None]) <= GATE * scale[:, None]).all(axis=2)
+        return np.where(inside, fitness(position), -np.inf)
+
+    rate = CountedFitness(gated)
+    order = np.argsort(cloud.log_weights, axis=1, kind="stable")
+    x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
+    logs = np.take_along_axis(cloud.log_weights, order, axis=1)
+    movers = max(1, round(form.fraction * form.particles))
+    position = x[..., :2]
+    moved = form.evolve(position, rate(position), movers, rate, streams)[:, :movers]
+    inside = np.isfinite(rate(moved))[:, :, None]
+    x[:, :movers, :2] = np.where(inside, moved, position[:, :movers])
+    share = np.take_along_axis(prior / prior.max(axis=1, keepdims=True), order, axis=1)[:, :movers]
+    likelihood = form.likelihood(recent, recent.epochs - 1, x[:, :movers])
+    logs[:, :movers] = likelihood + np.log(share.mean(axis=1, keepdims=True) + 1e-300)
+    return Cloud(x, logs), rate.points * recent.epochs + likelihood.size
+
+
+def evolve_degenerate(
+    form: EvolvingFilter,
+    scenario: Scenario,
+    cloud: Cloud,
+    k: int,
+    streams: Streams,
+    move: Move = move_worst,
+    memory: int = 1,
+) -> tuple[Cloud, float, Bool]:
+    """Weigh the particles, and move them in the runs whose weights degenerate; W = memory measurements count."""
+    predicted = cloud.log_weights
+    cloud, lookups, on_map = ParticleFilter.update(form, scenario, cloud, k, streams)
+    rows = np.flatnonzero(form.degenerate(normalise(cloud.log_weights)))
+    if len(rows):
+        recent = scenario.part(rows, max(0, k + 1 - memory), k + 1)
+        part = Cloud(cloud.x[rows], cloud.log_weights[rows])
+        part, points = move(form, recent, part, normalise(predicted[rows]), streams.take(rows))
+        cloud.x[rows], cloud.log_weights[rows] = part.x, part.log_weights
+        lookups += points / scenario.runs
+    return cloud, lookups, on_map
+
+
+def posterior(form: EvolvingFilter, recent: Scenario, mean: Float, covariance: Float) -> Fitness:
+    """Return the logarithm of the likelihood of the recent measurements times the Gaussian of the predicted cloud.
+
+    Of several measurements it is the likelihood that holds if the position error is the same at all of them.
+
+    Args:
+        form: the filter; recent: the measurements.
+        mean, covariance: of the predicted positions, shape (R, 2) and (R, 2, 2).
+    """
+    inverse = np.linalg.inv(covariance + 1e-6 * np.eye(2))
+
+    def fitness(position: Float) -> Float:
+        away = position - mean[:, None]
+        distance = ((away @ inverse) * away).sum(axis=2)
+        likelihood = np.zeros(position.shape[:2])
+        for epoch in range(recent.epochs):
+            likelihood += form.likelihood(recent, epoch, position)
+        likelihood -= 0.5 * distance
+        return likelihood
+
+    return fitness
