@@ -336,20 +336,26 @@ def sections(text: str) -> list[list[str]]:
     return [part.splitlines() for part in re.split(r"(?m)^(?=\$ )", text) if part]
 
 
-def compared(was: list[str], now: list[str], zero: float) -> list[str]:
-    """What the lines of a command differ in; lines that are new or gone do not make those after them differ."""
+def compared(was: list[str], now: list[str], zero: float) -> tuple[list[str], list[str]]:
+    """What the lines of a command differ in, and its lines anew: of two that are the same, that of before.
+
+    Lines that are new or gone do not make those after them differ.
+    """
     words = [[" ".join(NUMBER.sub("#", line).split()) for line in part] for part in (was, now)]
-    differences = []
+    differences, lines = [], []
     for tag, i, k, j, m in SequenceMatcher(None, *words, autojunk=False).get_opcodes():
         if tag != "equal":
             differences.append(
                 "\n".join([was[0], *(f"- {a}" for a in was[i:k]), *(f"+ {b}" for b in now[j:m])])
             )
+            lines += now[j:m]
             continue
         for a, b in zip(was[i:k], now[j:m], strict=True):
-            if not same(a, b, math.inf if ",undetermined," in a else zero):
+            alike = same(a, b, math.inf if ",undetermined," in a else zero)
+            lines.append(a if alike else b)
+            if not alike:
                 differences.append(f"{was[0]}\n- {a}\n+ {b}")
-    return differences
+    return differences, lines
 
 
 def same(expected: str, actual: str, zero: float = 1e-12) -> bool:
@@ -378,14 +384,20 @@ def test_commands_print_what_they_printed(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
     text = normal("\n".join(transcript(line, monkeypatch) for line in lines(CASES[name])))
     path = GOLDEN / f"{name}.txt"
-    if RENEW:
-        path.write_text(text)
-    differences: list[str] = []
-    for was, now in zip(sections(path.read_text()), sections(text), strict=True):
+    before = {part[0]: part for part in sections(path.read_text())} if path.exists() else {}
+    differences, lines_anew = [], []
+    for now in sections(text):
+        was = before.get(now[0], [now[0]])
         # Numbers that the poses do not determine are no contract.
         zero = math.inf if UNDETERMINED.search("\n".join(was)) else ZERO.get(name, 1e-12)
-        differences += compared(was, now, zero)
+        differ, anew = compared(was, now, zero)
+        differences += differ
+        lines_anew += anew
+    if RENEW:
+        path.write_text("\n".join(lines_anew) + "\n")
+        return
     assert not differences, f"{path.name}: {len(differences)} differences\n" + "\n".join(differences[:20])
+    assert len(before) == len(lines(CASES[name]))
 
 
 def test_the_comparison_sees_a_word_and_a_number():
