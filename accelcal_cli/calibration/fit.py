@@ -195,7 +195,7 @@ def fit(solution: Solution) -> Fit:
 
 
 def _absorbed(solution: Solution, observability: Observability) -> Float:
-    """Return (J^T W J)^-1 that leverages rest on, shape (R, 9, 9), with the weights of a robust loss if there is one."""
+    """Return (J^T W J)^-1 that leverages rest on, shape (R, 9, 9): with the weights of a robust loss, too."""
     if solution.noise is None:
         return observability.cofactor
     nine, point = solution.cost.in_lower(*solution.cost.parameters(solution.x))
@@ -427,12 +427,16 @@ def leave_out(
     kept = weights.copy()
     kept[sensors, pose] = 0.0
     with np.errstate(all="ignore"):
+        going = np.ones((len(pose), 1), dtype=bool)
         for _ in range(STEPS):
             e, rows, cofactor = _linearised(force, kept, g, free)
             step = np.zeros((len(pose), 9))
             step[:, free] = -(cofactor @ (rows.swapaxes(1, 2) @ (kept * e)[..., None]))[..., 0]
-            force = _moved(force, step, g)
-            if not np.any(np.abs(step) > SETTLED * g):
+            force = _moved(
+                force, np.where(going, step, 0.0), g
+            )  # each comes to the same point in any company
+            going &= (np.abs(step) > SETTLED * g).any(axis=1, keepdims=True)
+            if not going.any():
                 break
         e, rows, cofactor = _linearised(force, kept, g, free)
         freedom = np.count_nonzero(kept, axis=1) - len(free)

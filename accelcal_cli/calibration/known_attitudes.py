@@ -150,9 +150,9 @@ def _check_axes(readings: Readings, N: Float, K: Float) -> None:
 def _nine(K: Float, low: Float, cofactor: Float) -> Float:
     """Return the cofactor of the nine parameters, shape (9, 9), for K, K in gauge `lower`, and (F^T W F)^-1.
 
-    By d (nine parameters of gauge `lower`) / d Y, shape (9, 12): [dK_a dD_a] = K_a Y with Y in units of force (its first
-    three columns at 1 g), rows running slowest. So E = -Y / g in the body frame, R E R^T in that of gauge `lower`, and
-    of it the rotation is no change of the sensor.
+    By d (nine parameters of gauge `lower`) / d Y, shape (9, 12): [dK_a dD_a] = K_a Y with Y in units of force (its
+    first three columns at 1 g), rows running slowest. So E = -Y / g in the body frame, R E R^T in that of gauge
+    `lower`, and of it the rotation is no change of the sensor.
     """
     R = np.linalg.solve(low, K)
     columns = []
