@@ -14,11 +14,11 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
 from accelcal_cli.calibration.observability import (
     ALIGNED,
-    BIAS,
     ROWS_COLUMNS,
     Observability,
     Verdict,
     design,
+    propagate,
 )
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import (
@@ -96,7 +96,9 @@ class Fit:
         sigma_K, sigma_D: one-sigma of K and D, NaN where there is none.
         value: L, shape (R,), (m/s^2)^4.
         observability: what the poses say of the parameters, which the verdict rests on.
-        dop: dilution of precision of the nine parameters, shape (R, 9); information: J^T J of them, shape (R, 9, 9).
+        view: the observability that a verdict is explained with; see `_first_sight`.
+        dop: dilution of precision of the nine parameters, shape (R, 9); information: J^T J of them, shape (R, 9, 9);
+            sight: K and D, gauge `lower`, that directions are seen with, shapes (R, 3, 3) and (R, 3); all of the view.
         freedom: degrees of freedom, shape (R,).
         s: standard deviation of one pose's modulus (with known attitudes of one axis), m/s^2, NaN without freedom,
             shape (R,).
@@ -105,7 +107,8 @@ class Fit:
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
         residuals: pose by pose.
-        expected: variance of one pose that the scatter within the poses explains, (m/s^2)^2, shape (R,), or NaN.
+        noise_ratio, noise_p: s over the noise that the scatter within the poses predicts, and the p-value of so large a
+            ratio, shape (R,), NaN where nothing tells.
         solution: what was fitted; None with known attitudes.
         notes: of the solution, in sentences.
     """
@@ -121,8 +124,10 @@ class Fit:
     sigma_D: Float  # noqa: N815
     value: Float
     observability: Observability
+    view: Observability
     dop: Float
     information: Float
+    sight: tuple[Float, Float]
     freedom: Int
     s: Float
     covariance: Float
@@ -132,17 +137,10 @@ class Fit:
     before: list[str]
     nominal: Float
     residuals: PoseResiduals
-    expected: Float
+    noise_ratio: Float
+    noise_p: Float
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
-
-    def noise_ratio(self, at: int) -> tuple[float | None, float | None]:
-        """Return s of a sensor over the noise that its scatter predicts, and the p-value of so large a ratio."""
-        s, expected, freedom = float(self.s[at]), float(self.expected[at]), int(self.freedom[at])
-        if freedom < 1 or not s > 0 or not expected > 0:
-            return None, None
-        ratio = s / float(np.sqrt(expected))
-        return ratio, float(chi_square_chance(np.array([freedom * ratio**2]), np.array([freedom]))[0])
 
 
 def fit(solution: Solution) -> Fit:
@@ -161,6 +159,8 @@ def fit(solution: Solution) -> Fit:
     reading = _pass(solution, lower, own_D)
     residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
     variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
+    view, seen, sight = _first_sight(solution, observability, information, (lower, D))
+    ratio, p = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
     at_wall = _at_wall(solution.x)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
     shown = to_gauge(K, settings.gauge)
@@ -177,8 +177,10 @@ def fit(solution: Solution) -> Fit:
         sigma_D=sigma_D,
         value=solution.value,
         observability=observability,
-        dop=observability.dop,
-        information=information,
+        view=view,
+        dop=view.dop,
+        information=seen,
+        sight=sight,
         freedom=freedom,
         s=np.sqrt(variance),
         covariance=covariance,
@@ -188,10 +190,42 @@ def fit(solution: Solution) -> Fit:
         before=reading.words,
         nominal=reading.nominal,
         residuals=residuals,
-        expected=reading.sums[2] / sample.poses,
+        noise_ratio=ratio,
+        noise_p=p,
         solution=solution,
         notes=solution.notes,
     )
+
+
+def _first_sight(
+    solution: Solution, observability: Observability, information: Float, found: tuple[Float, Float]
+) -> tuple[Observability, Float, tuple[Float, Float]]:
+    """Return the observability that verdicts are explained with, the information, and the sensors' K and D.
+
+    Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
+    nearest sphere then sees the attitudes better than the fit does.
+    """
+    sphere = np.array([source == "sphere" for source in solution.stated.start.sources])
+    if not sphere.any():
+        return observability, information, found
+    held = None if solution.stated.settings.misalignment else ALIGNED
+    K, D = solution.cost.parameters(np.zeros_like(solution.x))
+    nine, point = solution.plain.in_lower(K, D)
+    round_information = nine.information(point)
+    view = Observability.of(round_information, solution.sample.poses, held)
+    sphere &= np.array([verdict == "undetermined" for verdict in view.verdicts])
+    square = sphere[:, None, None]
+    sight = np.where(square, K, found[0]), np.where(sphere[:, None], D, found[1])
+    return observability.replaced(sphere, view), np.where(square, round_information, information), sight
+
+
+def _noise_ratio(variance: Float, expected: Float, freedom: Int) -> tuple[Float, Float]:
+    """Return s over the noise of an expected variance, and the p-value of so large a ratio, shape (R,), or NaN."""
+    known = np.flatnonzero((freedom > 0) & (variance > 0) & (expected > 0))
+    ratio, p = np.full((2, len(variance)), np.nan)
+    ratio[known] = np.sqrt(variance[known]) / np.sqrt(expected[known])
+    p[known] = chi_square_chance(freedom[known] * ratio[known] ** 2, freedom[known])
+    return ratio, p
 
 
 def _absorbed(solution: Solution, observability: Observability) -> Float:
@@ -506,62 +540,3 @@ def firm(dop: Float, verdict: Sequence[Verdict], s: Float, g: float) -> Bool:
     bend = error.max(axis=1, keepdims=True) ** 2 / (2.0 * g)
     poor = np.array([word == "undetermined" for word in verdict], dtype=bool)
     return np.where(poor[:, None], bounded & (error >= bend), True)
-
-
-def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float) -> tuple[Float, Float]:
-    """Return one-sigma of K_a in a gauge, shape (..., 3, 3), and of D_a, shape (..., 3).
-
-    Args:
-        K: K_a in `gauge`, shape (..., 3, 3); K_lower: the same sensors in gauge `lower`.
-        covariance: of the nine parameters, (m/s^2)^2, shape (..., 9, 9).
-        gauge: `lower`, `upper` or `symmetric`; in `full` the free rotation moves every entry of K_a, the diagonal to
-            second order, and they come out as NaN.
-        g: local gravity, m/s^2.
-    """
-    variance = np.einsum("...pp->...p", covariance)
-    sigma_D = np.sqrt(variance[..., BIAS]) * np.einsum("...ii->...i", K_lower)
-    if gauge == "full":
-        return np.full(K.shape, np.nan), sigma_D
-    chain = gauge_chain(K, K_lower, gauge, g)
-    lost = np.isnan(variance[..., :6])
-    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance[..., :6, :6]), chain)
-    size = np.abs(chain)
-    felt = size > 1e-9 * size.max(axis=(-1, -2), keepdims=True)
-    touched = (felt & lost[..., None, :]).any(axis=-1)
-    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(square, 0.0))).reshape(K.shape)
-    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
-    # A zero of the gauge has no error.
-    return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
-
-
-def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
-    """Return d K / d parameters, shape (..., 9, 6): entries of K_a in a gauge by the first six of the nine parameters.
-
-    A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
-    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
-    W leaves the body frame unturned.
-    """
-    R = np.linalg.solve(K, K_lower)
-    turned = [K @ _skew(axis) for axis in np.eye(3)]
-    turns = np.stack([_conditions(change, gauge) for change in turned], axis=-1)
-    columns = []
-    for i, j in ROWS_COLUMNS[:6]:
-        moved = R[..., :, i, None] * R[..., None, :, j] / g  # R E R^T
-        change = -0.5 * K @ (moved + moved.swapaxes(-1, -2))
-        if gauge != "full":
-            angle = np.linalg.solve(turns, -_conditions(change, gauge)[..., None])
-            for k, turn in enumerate(turned):
-                change = change + angle[..., k, :, None] * turn
-        columns.append(change.reshape(*K.shape[:-2], 9))
-    return np.stack(columns, axis=-1)
-
-
-def _conditions(change: Float, gauge: str) -> Float:
-    """Return what must vanish for a change of K to stay in the gauge, shape (..., 3)."""
-    above, below = change[..., [0, 0, 1], [1, 2, 2]], change[..., [1, 2, 2], [0, 0, 1]]
-    return {"lower": above, "upper": below}.get(gauge, above - below)
-
-
-def _skew(axis: Float) -> Float:
-    x, y, z = axis
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

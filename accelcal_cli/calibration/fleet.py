@@ -163,7 +163,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         sigma_k=fit.sigma_K,
         sigma_d=fit.sigma_D,
         lower=fit.lower,
-        dop=assessment.dop,
+        dop=fit.dop,
         cost=fit.value,
         s=fit.s,
         rms=fit.rms,

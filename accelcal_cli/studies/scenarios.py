@@ -13,9 +13,19 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress_each, fit_ellipsoid, pack
+from accelcal_cli.calibration.problem import (
+    SHIFT,
+    Box,
+    Loetters,
+    Triangle,
+    compress_each,
+    fit_ellipsoid,
+    half_widths,
+    pack,
+    packed,
+)
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import SHIFT, half_widths, packed, polish
+from accelcal_cli.calibration.search import polish
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings
