@@ -82,9 +82,11 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
     if settings.attitudes == "known":
         from accelcal_cli.calibration.known_attitudes import fit_known
 
-        return assess(fit_known(sample, settings))
+        known = fit_known(sample, settings)
+        return assess(known)
     stated = state(sample, settings)
-    solution = reweight(search(stated, closed=closed))
+    solution = search(stated, closed=closed)
+    solution = reweight(solution)
     if sample.temperature is not None and settings.temperature:
         from accelcal_cli.calibration.temperature import with_slopes
 

@@ -20,16 +20,8 @@ from accelcal_cli.calibration.observability import (
     design,
     propagate,
 )
-from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import (
-    NO_NOISE,
-    SLOPES,
-    Search,
-    Solution,
-    loss_slope,
-    loss_weight,
-    modulus_errors,
-)
+from accelcal_cli.calibration.sample import Sample, loss_slope, loss_weight
+from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.sensor.model import Gauge, to_gauge
 
@@ -314,10 +306,10 @@ def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
     g, noise, sensors = settings.g, _robust(solution), len(solution.sample)
     centre = solution.stated.start.box.centre
     nominal, bias, words = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
-    raw = modulus_errors(sample, nominal[..., None] * np.eye(3), bias, g)
+    raw = sample.errors(nominal[..., None] * np.eye(3), bias, g)
     sums: list[Float] = []
     parts: list[list[Float]] = []
-    for (first, e, f), (_, e_raw, _) in zip(modulus_errors(sample, K, D, g), raw, strict=True):
+    for (first, e, f), (_, e_raw, _) in zip(sample.errors(K, D, g), raw, strict=True):
         real = sample.real(first, e.shape[1])
         w = real.astype(float) if weights is None else weights[:, first : first + e.shape[1]]
         psi: Float = np.zeros((sensors, 1))
