@@ -138,25 +138,20 @@ class Fit:
 def fit(solution: Solution) -> Fit:
     """Fit a solution: one pass over the readings, everything for all sensors at once."""
     settings, sample = solution.stated.settings, solution.sample
-    g = settings.g
+    g, held = settings.g, None if settings.misalignment else ALIGNED
     K, D = solution.cost.parameters(solution.x)
-    nine, point = solution.plain.in_lower(K, D)
-    lower, own_D = nine.parameters(point)
-    information = nine.information(point)
-    if solution.slopes is not None:
-        information = information - solution.slopes.loss
-    held = None if settings.misalignment else ALIGNED
+    lower, own_D, information = _determined(solution, K, D)
     observability = Observability.of(information, sample.poses, held)
     freedom = sample.poses - min(9, solution.cost.unknowns) - SLOPES * (solution.slopes is not None)
     reading = _pass(solution, lower, own_D)
     residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
     variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
-    view, seen, sight = _first_sight(solution, observability, information, (lower, D))
     ratio, p = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
     at_wall = _at_wall(solution.x)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
     shown = to_gauge(K, settings.gauge)
     sigma_K, sigma_D = propagate(shown, lower, covariance, settings.gauge, g)
+    view, information, sight = _first_sight(solution, observability, information, (lower, D))
     return Fit(
         sample=sample,
         settings=settings,
@@ -171,7 +166,7 @@ def fit(solution: Solution) -> Fit:
         observability=observability,
         view=view,
         dop=view.dop,
-        information=seen,
+        information=information,
         sight=sight,
         freedom=freedom,
         s=np.sqrt(variance),
@@ -187,6 +182,14 @@ def fit(solution: Solution) -> Fit:
         solution=solution,
         notes=solution.notes,
     )
+
+
+def _determined(solution: Solution, K: Float, D: Float) -> tuple[Float, Float, Float]:
+    """Return K and D in gauge `lower` and J^T J of the nine parameters, less what temperature slopes take of it."""
+    nine, point = solution.plain.in_lower(K, D)
+    information = nine.information(point)
+    loss = 0.0 if solution.slopes is None else solution.slopes.loss
+    return *nine.parameters(point), information - loss
 
 
 def _first_sight(

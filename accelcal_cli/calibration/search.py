@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.problem import Loetters, Start, compress, packed, search_box
+from accelcal_cli.calibration.problem import Loetters, Start, compress, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.optimization.minimize import Run, minimize
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.optimization.minimize import Run, minimize, polish
 
 SAME_MINIMUM = 1e-6
 """Two searches ended in the same minimum when their polished costs differ by at most this part."""
@@ -136,14 +135,9 @@ class Solution:
 def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
     weights = None if settings.weights == "auto" else sample.weights(settings.weights)
-    stated = _stated(sample, settings, weights)
+    cost, start = opened(sample, settings, weights)
+    stated = Stated(sample, settings, weights, cost, start)
     return _shared(stated) if settings.weights == "auto" else stated
-
-
-def _stated(sample: Sample, settings: Settings, weights: Float | None) -> Stated:
-    triangle = packed(sample, weights)
-    start = search_box(triangle, settings)
-    return Stated(sample, settings, weights, Loetters(triangle, settings.g, start.box), start)
 
 
 def search(stated: Stated, *, closed: bool = False) -> Solution:
@@ -211,12 +205,6 @@ def rounding(cost: Loetters) -> Float:
     return np.asarray(ROUNDING * cost.triangle.poses * cost.g**4)
 
 
-def polish(cost: Loetters, x: Float) -> Run:
-    """Return Levenberg-Marquardt runs from x, shape (R, D), inside the box."""
-    solver = OPTIMIZERS.get("levenberg-marquardt")()
-    return minimize(cost, solver, runs=len(x), start=x[:, None, :], trace=False)
-
-
 def reweight(solution: Solution) -> Solution:
     """Solve again under the robust loss, if there is one: weights from the residuals, residuals from the weights."""
     settings, sample = solution.stated.settings, solution.stated.sample
@@ -254,7 +242,9 @@ def _shared(stated: Stated) -> Stated:
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
         before, weights = shared, 1.0 / (shared + own)
-        stated = _stated(sample, settings, weights / weights.mean())
+        weights = weights / weights.mean()
+        cost, start = opened(sample, settings, weights)
+        stated = Stated(sample, settings, weights, cost, start)
     return stated
 
 

@@ -36,9 +36,9 @@ from accelcal_cli.calibration.observability import (
 from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import polish
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
