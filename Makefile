@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_NO_DEPS PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION
 unexport PIP_IGNORE_INSTALLED PIP_PYTHON PIP_REPORT PYTHONPATH PYTHONHOME
 
-.PHONY: help demo test lint types bench docs pictures clean
+.PHONY: help demo test lint types bench docs golden pictures clean
 .DELETE_ON_ERROR:
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo "make types    mypy"
 	@echo "make bench    run the benchmarks; ARGS=optimizers only those of the optimizers"
 	@echo "make docs     write the tables and outputs in the documentation anew"
+	@echo "make golden   write the frozen outputs of the commands anew"
 	@echo "make pictures draw the pictures of the optimizers anew"
 	@echo "make clean    remove what make made"
 
@@ -41,6 +42,9 @@ bench: $(VENV)/installed-bench
 
 docs: $(VENV)/installed-test
 	$(BIN)/python tests/test_docs.py
+
+golden: $(VENV)/installed-test
+	ACCELCAL_GOLDEN=renew $(BIN)/python -m pytest tests/journeys/test_golden.py
 
 pictures: $(VENV)/installed-test
 	$(BIN)/python tests/test_docs.py pictures

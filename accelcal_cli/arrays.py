@@ -1,4 +1,4 @@
-"""The array types of the whole house: numbers, indices, truth values."""
+"""The array types of all packages: numbers, indices, truth values."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ AHEAD = 40 * 1024
 
 
 class Purpose(IntEnum):
-    """What numbers are drawn for: under one seed each purpose has streams of its own.
+    """What the numbers are for: under one seed each purpose has streams of its own.
 
     The values are part of every seeded result: a new purpose takes a new number, and none is changed.
     """
@@ -51,12 +51,12 @@ class Purpose(IntEnum):
 
 @dataclass
 class _Stock:
-    """What one call has drawn for several iterations.
+    """The arrays that one call has made for several iterations.
 
     Attributes:
         key: function, rows and columns of the iterations.
         states: of the generators before the draw.
-        steps: K, the iterations that it was drawn for; used: those that are over.
+        steps: K, the number of iterations; used: how many of them are over.
         arrays: of the iterations to come.
     """
 
@@ -152,7 +152,7 @@ class Streams:
 
     def take(self, index: Int) -> Streams:
         """Return the streams of the runs at `index`, going on where they stand."""
-        chosen = Streams(self._seed, (self._runs[i] for i in index), self._purpose)
+        part = Streams(self._seed, (self._runs[i] for i in index), self._purpose)
         # Shared: what one draws the other does not draw again.
-        chosen._started = [self.generators[i] for i in index]
-        return chosen
+        part._started = [self.generators[i] for i in index]
+        return part

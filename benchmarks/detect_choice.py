@@ -13,7 +13,7 @@ from accelcal_cli.detection.detect import Detection, DetectSettings, detect
 from accelcal_cli.detection.rawlog import open_raw_log
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, handled, load_sensor
+from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate_log
 
 G, POSES, MODEL_ERROR = 9.80665, 18, 0.003
 """m/s^2, poses of a log, and the error that each keeps beside its noise, m/s^2."""
@@ -24,7 +24,7 @@ def log(seed: int) -> bytes:
     sensor = load_sensor("mems")
     u = directions(POSES, "random", Streams(seed, [0], purpose=7).normal(POSES, 3)[0])
     lines = []
-    for part in handled(sensor, u, G, Handling(hold=4, move=1.5, tremor=0.03), 0.05, seed):
+    for part in simulate_log(sensor, u, G, Handling(hold=4, move=1.5, tremor=0.03), 0.05, seed):
         own = MODEL_ERROR * sensor.K_a[0][0] * Streams(seed, [part.pose], purpose=9).normal(1, 3)[0]
         lines += [",".join(f"{cell:.8g}" for cell in row) + "\n" for row in part.output + own]
     return "".join(lines).encode()

@@ -11,7 +11,7 @@ import numpy as np
 
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, handled, load_sensor
+from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate_log
 from benchmarks.clock import pairs, process, report
 
 G = 9.80665
@@ -31,7 +31,7 @@ def write(path: Path, rows: int) -> None:
 
     count = rows // 6000 + 2
     u = directions(count, "random", Streams(4, [0]).normal(count, 3)[0])
-    stretches = handled(load_sensor("mems"), u, G, Handling(hold=55, move=5, tremor=0.01), 0.05, seed=4)
+    stretches = simulate_log(load_sensor("mems"), u, G, Handling(hold=55, move=5, tremor=0.01), 0.05, seed=4)
     with path.open("wb") as file:
         written = 0
         for stretch in stretches:

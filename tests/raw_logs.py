@@ -1,4 +1,4 @@
-"""Simulated raw logs for the tests."""
+"""SimulatedReadings raw logs for the tests."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import io
 
 import numpy as np
 
-from accelcal_cli.detection.rawlog import RawLog, RawRows, open_raw_log
+from accelcal_cli.detection.rawlog import RawLog, open_raw_log
 from accelcal_cli.sensor.poses import directions
-from accelcal_cli.sensor.simulation import Handling, handled, load_sensor
+from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate_log
 
 G = 9.80665
 
@@ -17,7 +17,7 @@ def simulated(positions=14, *, seed=1, noise=0.03, gyro=True, timed=True, **hand
     """Rows of a log, shape (n, 3 to 7), and first and last row of each hold, from 1."""
     parts, holds, row = [], [], 0
     u = directions(positions, "fibonacci", np.empty((0, 3)))
-    for part in handled(load_sensor("mems"), u, G, Handling(**handling), noise, seed):
+    for part in simulate_log(load_sensor("mems"), u, G, Handling(**handling), noise, seed):
         columns = [part.output] + [part.gyro] * gyro + [part.time[:, None]] * timed
         parts.append(np.hstack(columns))
         if part.pose:
@@ -26,12 +26,12 @@ def simulated(positions=14, *, seed=1, noise=0.03, gyro=True, timed=True, **hand
     return np.concatenate(parts), np.array(holds)
 
 
-def in_blocks(numbers, sizes, *, gyro=True, timed=True):
+def in_blocks(numbers, sizes):
     """The rows in blocks of the given sizes, over and over."""
     at, k = 0, 0
     while at < len(numbers):
         size = sizes[k % len(sizes)]
-        yield RawRows(numbers[at : at + size], gyro, timed)
+        yield numbers[at : at + size]
         at, k = at + size, k + 1
 
 

@@ -30,6 +30,8 @@ import yaml
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
 from accelcal_cli.cli.main import app
+from accelcal_cli.cli.options import help_text
+from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.sensor.simulation import Sensor, Spread
 
@@ -39,7 +41,7 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)(?: +(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 GENERATED = re.compile(
-    r"(<!-- (options|keys|parameters|optimizers): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL
+    r"(<!-- (options|keys|parameters|optimizers|exporters): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL
 )
 SYMBOL = re.compile(r" \((\w+(?:, or \w+)?)\)|(?<=S-curve): (\w)$")
 """The symbol of a setting in its description."""
@@ -220,7 +222,8 @@ def option_table(command: str) -> str:
             )
         elif default is None:
             default = ""
-        rows.append(f"| {shown} | {default} | {_cell(parameter.help)} |")
+        meaning = help_text(parameter, None, parameter.help)
+        rows.append(f"| {shown} | {default} | {_cell(meaning)} |")
     return "\n".join(rows) + "\n"
 
 
@@ -282,6 +285,17 @@ def optimizer_table(_: str) -> str:
     return "\n".join(rows) + "\n"
 
 
+def exporter_table(_: str) -> str:
+    """Return the formats of `export` with what they are, their usual suffix and their options, one a row."""
+    rows = ["| format | what it is | file | options |", "| --- | --- | --- | --- |"]
+    for name in EXPORTERS.names():
+        cls = EXPORTERS.get(name)
+        taken = ", ".join(f"`--{field.name.replace('_', '-')}`" for field in dataclasses.fields(cls))
+        kind = f"`{cls.suffix}`{', binary' if cls.binary else ''}"
+        rows.append(f"| `{name}` | {_cell((cls.__doc__ or '').splitlines()[0])} | {kind} | {taken} |")
+    return "\n".join(rows) + "\n"
+
+
 def _default(field: Any) -> str:
     value = field.default
     if value is dataclasses.MISSING or dataclasses.is_dataclass(value):
@@ -313,6 +327,7 @@ TABLES = {
     "keys": key_table,
     "parameters": parameter_table,
     "optimizers": optimizer_table,
+    "exporters": exporter_table,
 }
 
 
@@ -339,6 +354,13 @@ def test_every_command_is_documented():
     assert markers("reference/commands.md", "options") == commands
     text = (DOCS / "reference" / "commands.md").read_text("utf-8")
     assert commands <= set(re.findall(r"^## accelcal (\S+)$", text, re.MULTILINE))
+
+
+def test_every_format_is_documented():
+    assert markers("reference/exports.md", "exporters") == {"all"}
+    text = (DOCS / "reference" / "exports.md").read_text("utf-8")
+    headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
+    assert set(EXPORTERS.names()) <= {name for heading in headings for name in heading.split(", ")}
 
 
 def test_every_key_is_documented():

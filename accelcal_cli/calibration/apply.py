@@ -20,9 +20,8 @@ from accelcal_cli.calibration.fit import gauge_chain
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import Table, TextTable
+from accelcal_cli.io.reader import Selection, Table, TextTable
 from accelcal_cli.io.rewrite import Change, rewrite
-from accelcal_cli.io.text import Selection
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES
 

@@ -21,11 +21,10 @@ from accelcal_cli.calibration.observability import (
     WEAK,
     Observability,
     Verdict,
-    information,
     knowing,
     next_poses,
 )
-from accelcal_cli.calibration.search import Solution, in_lower, rounding
+from accelcal_cli.calibration.search import Solution, rounding
 from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
 FEWEST_POSES = 12
@@ -135,7 +134,8 @@ def _first_sight(fit: Fit) -> tuple[Observability, Float, Float, tuple[Float, Fl
         return own
     held = None if fit.settings.misalignment else ALIGNED
     K, D = solution.cost.parameters(np.zeros_like(solution.x))
-    determined = information(*in_lower(solution.plain, K, D))
+    nine, point = solution.plain.in_lower(K, D)
+    determined = nine.information(point)
     views = Observability.of(determined, fit.sample.poses, held)
     sphere = np.array([source == "sphere" for source in solution.stated.start.sources])
     sphere &= np.array([verdict == "undetermined" for verdict in views.verdicts])

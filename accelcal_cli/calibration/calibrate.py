@@ -13,13 +13,10 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.known_attitudes import fit_known
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
-from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.sample import NEEDS, Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.temperature import with_slopes
-from accelcal_cli.calibration.weights import NEEDS, without_weights
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import ErrorModel
@@ -83,14 +80,21 @@ def _groups(readings: Sequence[Readings], settings: Settings) -> list[list[int]]
 def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Assessment:
     """Take a sample without faults through the flow; `closed` as in `search`."""
     if settings.attitudes == "known":
+        from accelcal_cli.calibration.known_attitudes import fit_known
+
         return assess(fit_known(sample, settings))
-    return assess(fit(with_slopes(reweight(search(state(sample, settings), closed=closed)))))
+    solution = reweight(search(state(sample, settings), closed=closed))
+    if sample.temperature is not None and settings.temperature:
+        from accelcal_cli.calibration.temperature import with_slopes
+
+        solution = with_slopes(solution)
+    return assess(fit(solution))
 
 
 def faults(sample: Sample, settings: Settings) -> list[str]:
     """Return why each sensor cannot be calibrated, in a sentence, or nothing."""
     words = [""] * len(sample)
-    for at in np.flatnonzero(without_weights(sample, settings.weights)).tolist():
+    for at in np.flatnonzero(sample.without_weights(settings.weights)).tolist():
         words[at] = f"--weights {settings.weights} needs {NEEDS[settings.weights]}"
     for at in np.flatnonzero(~(sample.upper > sample.lower).any(axis=1)).tolist():
         poses = int(sample.poses[at])
@@ -108,8 +112,6 @@ def record(assessment: Assessment, at: int) -> Calibration:
     K_A = np.linalg.inv(K)
     ratio, chance = fit.noise_ratio(at)
     solution = fit.solution
-    unused = solution is not None and readings.reference is not None
-    reference = ("The columns of a reference specific force are used with --attitudes known only.",)
     return Calibration(
         K_a=K,
         D_a=fit.D[at],
@@ -146,7 +148,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         settings=_settings_record(assessment, at),
         g=settings.g,
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
-        notes=(*readings.notes, *(reference if unused else ()), *fit.notes, *_notes(assessment, at)),
+        notes=_notes(assessment, at),
         version=__version__,
         temperature=None if solution is None or solution.slopes is None else solution.slopes.temperature,
     )
@@ -203,9 +205,13 @@ def _settings_record(assessment: Assessment, at: int) -> dict[str, object]:
 
 
 def _notes(assessment: Assessment, at: int) -> tuple[str, ...]:
-    """Return what a user should know of the search, in sentences."""
-    solution, search = assessment.fit.solution, assessment.fit.search
-    lines = []
+    """Return what a user should know of the readings, the fit and the search, in sentences."""
+    fit, readings = assessment.fit, assessment.fit.sample.readings(at)
+    solution, search = fit.solution, fit.search
+    lines = list(readings.notes)
+    if solution is not None and readings.reference is not None:
+        lines.append("The columns of a reference specific force are used with --attitudes known only.")
+    lines += fit.notes
     if solution is not None and solution.stated.start.sources[at] == "sphere":
         lines.append("The readings fix no ellipsoid; the search started from the nearest sphere.")
     if not np.isfinite(search.cost[at]):

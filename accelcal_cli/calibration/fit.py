@@ -11,21 +11,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.box import uncalibrated
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     BIAS,
+    ROWS_COLUMNS,
     Observability,
     Verdict,
     design,
-    information,
 )
-from accelcal_cli.calibration.problem import ROWS_COLUMNS
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution, in_lower, modulus_errors
+from accelcal_cli.calibration.search import (
+    NO_NOISE,
+    SLOPES,
+    Search,
+    Solution,
+    loss_slope,
+    loss_weight,
+    modulus_errors,
+)
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import explained, loss_slope, loss_weight
 from accelcal_cli.sensor.model import Gauge, to_gauge
 
 KEPT = 1000
@@ -144,21 +149,17 @@ def fit(solution: Solution) -> Fit:
     """Fit a solution: one pass over the readings, everything for all sensors at once."""
     settings, sample = solution.stated.settings, solution.sample
     g = settings.g
-    held = None if settings.misalignment else ALIGNED
     K, D = solution.cost.parameters(solution.x)
-    nine, point = in_lower(solution.plain, K, D)
+    nine, point = solution.plain.in_lower(K, D)
     lower, own_D = nine.parameters(point)
-    found = information(nine, point)
+    information = nine.information(point)
     if solution.slopes is not None:
-        found = found - solution.slopes.loss
-    observability = Observability.of(found, sample.poses, held)
-    slopes = 0 if solution.slopes is None else SLOPES
-    freedom = sample.poses - min(9, solution.cost.unknowns) - slopes
-    cofactor = observability.cofactor
-    if solution.noise is not None:  # leverages rest on the robust weights, too
-        cofactor = Observability.of(information(*in_lower(solution.cost, K, D)), 0).cofactor
+        information = information - solution.slopes.loss
+    held = None if settings.misalignment else ALIGNED
+    observability = Observability.of(information, sample.poses, held)
+    freedom = sample.poses - min(9, solution.cost.unknowns) - SLOPES * (solution.slopes is not None)
     reading = _pass(solution, lower, own_D)
-    residuals = _residuals(reading, sample, cofactor, freedom, held, g)
+    residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
     variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
     at_wall = _at_wall(solution.x)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
@@ -177,7 +178,7 @@ def fit(solution: Solution) -> Fit:
         value=solution.value,
         observability=observability,
         dop=observability.dop,
-        information=found,
+        information=information,
         freedom=freedom,
         s=np.sqrt(variance),
         covariance=covariance,
@@ -191,6 +192,14 @@ def fit(solution: Solution) -> Fit:
         solution=solution,
         notes=solution.notes,
     )
+
+
+def _absorbed(solution: Solution, observability: Observability) -> Float:
+    """Return (J^T W J)^-1 that leverages rest on, shape (R, 9, 9): with the weights of a robust loss, too."""
+    if solution.noise is None:
+        return observability.cofactor
+    nine, point = solution.cost.in_lower(*solution.cost.parameters(solution.x))
+    return Observability.of(nine.information(point), 0).cofactor
 
 
 def _at_wall(x: Float) -> Bool:
@@ -235,6 +244,30 @@ class _Pass:
         return np.asarray(self.sums[4] / room / (self.sums[5] / solution.sample.poses) ** 2)
 
 
+def uncalibrated(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:
+    """Return scale factors and biases, shape (R, 3), that readings have before calibration, and the same in words.
+
+    A stated nominal sensor; else, for readings that are specific force already, themselves; else one scale factor for
+    all axes and the bias in the middle, which is what a user without calibration could do.
+
+    Args:
+        scale: mean scale factor, output units per m/s^2, shape (R,); D: bias, output units, shape (R, 3).
+        settings: may state a nominal sensor.
+    """
+    if settings.nominal is not None:
+        k, bias = (np.broadcast_to(v, D.shape) for v in (settings.nominal.scale, settings.nominal.bias))
+        return k, bias, ["the stated nominal sensor"] * len(D)
+    # A nominal scale factor carries no more than three significant digits.
+    rounded = np.array([float(f"{value:.3g}") for value in scale.tolist()])
+    force = (rounded > 0.8) & (rounded < 1.25)  # specific force already, in m/s^2 or in g
+    words = "one scale factor for all axes and the estimated bias, no misalignment"
+    return (
+        np.repeat(np.where(force, 1.0, rounded)[:, None], 3, axis=1),
+        np.where(force[:, None], 0.0, D),
+        ["the readings as they are" if f else words for f in force],
+    )
+
+
 def _robust(solution: Solution) -> Float | None:
     """Return the noise that a robust loss rests on, m/s^2, shape (R,); None when all poses counted alike."""
     noise = solution.noise
@@ -261,7 +294,7 @@ def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
             slope = loss_slope(z, settings.robust)
             w = w * loss_weight(z, settings.robust)
         scaled = np.sqrt(w) * e
-        expected = np.where(real, _expected(sample, first, f, K), 0.0)
+        expected = np.where(real, sample.explained(first, f, K), 0.0)
         squares = (real * length_error(e, g) ** 2, real * length_error(e_raw, g) ** 2, expected, scaled**2)
         sums.append(np.stack([np.sum(part, axis=1) for part in (*squares, psi**2, slope)]))
         number = np.broadcast_to(first + np.arange(e.shape[1]), e.shape)
@@ -279,15 +312,6 @@ def _worst(columns: list[Float], sample: Sample) -> list[Float]:
     index = np.sort(np.argpartition(-size, last, axis=1)[:, :KEPT_WORST], axis=1)
     rows = np.arange(len(size))[:, None]
     return [column[rows, index] for column in columns]
-
-
-def _expected(sample: Sample, first: int, f: Float, K: Float) -> Float:
-    """Return the variance of each pose of a block that its scatter explains, (m/s^2)^2, shape (R, B), or NaN."""
-    if sample.scatter is None or sample.count is None:
-        return np.full(f.shape[:2], np.nan)
-    part = slice(first, first + f.shape[1])
-    u = f / np.linalg.norm(f, axis=2, keepdims=True)
-    return explained(u, sample.scatter[:, part], sample.count[:, part], np.einsum("rii->ri", K))
 
 
 def length_error(e: Float, g: float) -> Float:
@@ -403,12 +427,16 @@ def leave_out(
     kept = weights.copy()
     kept[sensors, pose] = 0.0
     with np.errstate(all="ignore"):
+        going = np.ones((len(pose), 1), dtype=bool)
         for _ in range(STEPS):
             e, rows, cofactor = _linearised(force, kept, g, free)
             step = np.zeros((len(pose), 9))
             step[:, free] = -(cofactor @ (rows.swapaxes(1, 2) @ (kept * e)[..., None]))[..., 0]
-            force = _moved(force, step, g)
-            if not np.any(np.abs(step) > SETTLED * g):
+            force = _moved(
+                force, np.where(going, step, 0.0), g
+            )  # each comes to the same point in any company
+            going &= (np.abs(step) > SETTLED * g).any(axis=1, keepdims=True)
+            if not going.any():
                 break
         e, rows, cofactor = _linearised(force, kept, g, free)
         freedom = np.count_nonzero(kept, axis=1) - len(free)

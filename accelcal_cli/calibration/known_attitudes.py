@@ -11,14 +11,19 @@ from __future__ import annotations
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.box import uncalibrated
-from accelcal_cli.calibration.fit import KEPT, KEPT_WORST, OUTLIER_LEVEL, Fit, PoseResiduals, room_of
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, Observability
-from accelcal_cli.calibration.problem import ROWS_COLUMNS
+from accelcal_cli.calibration.fit import (
+    KEPT,
+    KEPT_WORST,
+    OUTLIER_LEVEL,
+    Fit,
+    PoseResiduals,
+    room_of,
+    uncalibrated,
+)
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import pose_weights
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import to_gauge
@@ -45,25 +50,18 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     """
     readings, g = sample.readings(0), settings.g
     f = _reference(sample, settings, readings)[0]
-    weights = pose_weights(sample, settings.weights)
-    w = np.ones(len(f)) if weights is None else weights[0]
+    w = np.ones(len(f)) if (weights := sample.weights(settings.weights)) is None else weights[0]
     N = sample.output()[0]
-    K, D, cofactor, rank = _solved(N, f / g, w)
+    F = np.concatenate([f / g, np.ones((len(f), 1))], axis=1)
+    K, D, cofactor = _solved(N, F, w, readings)
     K = K / g
-    if rank < 4:
-        raise DataError(
-            f"{readings.source}: the known attitudes span {rank} of 4 dimensions; turn the sensor to at least "
-            f"four attitudes that do not lie in one plane, better {FEWEST_POSES} or more"
-        )
     _check_axes(readings, N, K)
     error = np.linalg.solve(K, (N - f @ K.T - D).T).T  # K_a^-1 (N - K_a f - D_a), m/s^2, shape (J, 3)
     freedom = 3 * len(f) - 12
     s = np.sqrt(np.sum((np.sqrt(w)[:, None] * error) ** 2) / freedom) if freedom > 0 else np.float64(np.nan)
-    F = np.concatenate([f / g, np.ones((len(f), 1))], axis=1)
     leverage = np.minimum(w * np.einsum("ji,ik,jk->j", F, cofactor, F), 1.0)
     low = to_gauge(K, "lower")
-    chain = _nine(K, low)
-    nine = chain @ np.kron(np.eye(3), cofactor) @ chain.T
+    nine = _nine(K, low, cofactor)
     dop = np.sqrt(np.diagonal(cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
     size = np.sqrt(np.diagonal(K @ K.T))  # the output of each axis for one unit of force along it
     nominal, bias, before = uncalibrated(np.array([size.mean()]), D[None], settings)
@@ -83,7 +81,7 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         sigma_K=(s * np.outer(size, dop[:3]) / g)[None],
         sigma_D=(s * size * dop[3])[None],
         value=value,
-        observability=Observability(cofactor[None], dop[None], dop[None], np.array([rank]), NAMES),
+        observability=Observability(cofactor[None], dop[None], dop[None], np.array([4]), NAMES),
         dop=np.sqrt(np.diagonal(nine))[None],
         information=np.linalg.pinv(nine)[None],
         freedom=np.array([freedom]),
@@ -115,19 +113,23 @@ def _reference(sample: Sample, settings: Settings, readings: Readings) -> Float:
     return sample.reference
 
 
-def _solved(N: Float, f: Float, w: Float) -> tuple[Float, Float, Float, int]:
-    """Return K g, D, (F^T W F)^-1, its pseudo-inverse below rank 4, and the rank of F = [f 1].
+def _solved(N: Float, F: Float, w: Float, readings: Readings) -> tuple[Float, Float, Float]:
+    """Return K g, D and (F^T W F)^-1, shape (4, 4).
 
-    N: outputs, shape (J, 3); f: specific force in g, same shape; w: weights, shape (J,).
+    N: outputs, shape (J, 3); F: rows [f 1], f the specific force in g, shape (J, 4); w: weights, shape (J,).
     """
-    F = np.concatenate([f, np.ones((len(f), 1))], axis=1)
     root = np.sqrt(w)[:, None]
     values, vectors = np.linalg.eigh((F * root).T @ (F * root))
-    known = values > RANK_TOLERANCE * values[-1]
-    cofactor = (vectors * np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)) @ vectors.T
+    rank = int((values > RANK_TOLERANCE * values[-1]).sum())
+    if rank < 4:
+        raise DataError(
+            f"{readings.source}: the known attitudes span {rank} of 4 dimensions; turn the sensor to at least "
+            f"four attitudes that do not lie in one plane, better {FEWEST_POSES} or more"
+        )
+    cofactor = (vectors * (1.0 / values)) @ vectors.T
     middle = N.mean(axis=0)  # keeps the digits that a large offset would eat
     theta = cofactor @ (F * root**2).T @ (N - middle)
-    return theta[:3].T, theta[3] + middle, cofactor, int(known.sum())
+    return theta[:3].T, theta[3] + middle, cofactor
 
 
 def _check_axes(readings: Readings, N: Float, K: Float) -> None:
@@ -145,11 +147,12 @@ def _check_axes(readings: Readings, N: Float, K: Float) -> None:
         )
 
 
-def _nine(K: Float, low: Float) -> Float:
-    """Return d (nine parameters of gauge `lower`) / d Y, shape (9, 12), for K and K in gauge `lower`.
+def _nine(K: Float, low: Float, cofactor: Float) -> Float:
+    """Return the cofactor of the nine parameters, shape (9, 9), for K, K in gauge `lower`, and (F^T W F)^-1.
 
-    [dK_a dD_a] = K_a Y with Y in units of force (its first three columns at 1 g), rows running slowest. So
-    E = -Y / g in the body frame, R E R^T in that of gauge `lower`, and of it the rotation is no change of the sensor.
+    By d (nine parameters of gauge `lower`) / d Y, shape (9, 12): [dK_a dD_a] = K_a Y with Y in units of force (its
+    first three columns at 1 g), rows running slowest. So E = -Y / g in the body frame, R E R^T in that of gauge
+    `lower`, and of it the rotation is no change of the sensor.
     """
     R = np.linalg.solve(low, K)
     columns = []
@@ -160,7 +163,8 @@ def _nine(K: Float, low: Float) -> Float:
         both = E + E.T
         column = [both[i, j] * (0.5 if i == j else 1.0) for i, j in ROWS_COLUMNS[:6]]
         columns.append([*column, *(K @ Y[:, 3] / np.diagonal(low))])
-    return np.array(columns).T
+    chain = np.array(columns).T
+    return np.asarray(chain @ np.kron(np.eye(3), cofactor) @ chain.T)
 
 
 def _residuals(

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.problem import ROWS_COLUMNS, Loetters, pack
 from accelcal_cli.sensor.model import ErrorModel
+
+ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
+"""Which K_ij each unknown is: diagonal, below it, above it (the last three in gauge `full` alone)."""
 
 PARAMETERS = (
     "scale factor x",
@@ -161,30 +163,6 @@ class Observability:
         """Return the names of the parameters whose bounded dilution is above `limit`, worst first. One set of poses."""
         order = np.argsort(-np.round(self.bounded, 3), kind="stable")
         return [self.names[i] for i in order if self.bounded[i] > limit]
-
-
-def jacobian(problem: Loetters, x: Float) -> Float:
-    """Return d (-e) / d parameters of the compressed residuals, shape (R, 11, 9), at x, shape (R, 9).
-
-    The chain runs over K_a = K_a0 (I + E)^-1, so dK_a = -K_a0 E, and dD_i = K_ii times the bias as force.
-    """
-    K, _ = problem.parameters(x)
-    chain = np.zeros((len(K), 9, 9))
-    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
-        change = np.zeros_like(K)
-        change[:, :, j] = -K[:, :, i] / problem.g
-        chain[:, :, p] = pack(change, np.zeros((len(K), 3)), 9)
-    for i in range(3):
-        chain[:, 6 + i, 6 + i] = K[:, i, i]
-    result: Float = problem.jacobian(x[:, None])[:, 0] / problem.units[:, None, :] @ chain / (2.0 * problem.g)
-    return result
-
-
-def information(problem: Loetters, x: Float) -> Float:
-    """Return J^T J of the nine parameters, shape (R, 9, 9), at x, shape (R, 9), from the compressed readings."""
-    J = jacobian(problem, x)
-    result: Float = J.swapaxes(1, 2) @ J
-    return result
 
 
 def directions_of(output: Float, model: ErrorModel) -> Float:

@@ -28,10 +28,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
+from accelcal_cli.calibration.observability import ROWS_COLUMNS
 from accelcal_cli.optimization.problem import Problem
-
-ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
-"""Which K_ij each unknown is: diagonal, below it, above it (the last three in gauge `full` alone)."""
+from accelcal_cli.sensor.model import to_gauge
 
 AROUND = {
     n + 1: np.array([positions.get((i % 3, j % 3), n) for i in range(5) for j in range(5)])
@@ -190,6 +189,41 @@ class Loetters(Problem):
     def coordinates(self, K: Float, D: Float) -> Float:
         """Return the point of the box, shape (R, D), at K_a, shape (R, 3, 3), and D_a, shape (R, 3)."""
         return (pack(K, D, self.unknowns) - self.box.centre) / self.box.half
+
+    def in_lower(self, K: Float, D: Float) -> tuple[Loetters, Float]:
+        """Return the nine-parameter problem of the same readings, and its point, shape (R, 9), for sensors K and D.
+
+        Uncertainty is always computed in gauge `lower`, whatever is searched or printed.
+        """
+        half = self.box.half
+        # Any width: derivatives alone are asked for.
+        turned = half[:, 3:6] if self.unknowns > 6 else half[:, :3]
+        half = np.concatenate([half[:, :3], turned, half[:, -3:]], axis=1)
+        nine = Loetters(self.triangle, self.g, Box(np.zeros((len(K), 9)), half))
+        return nine, nine.coordinates(to_gauge(K, "lower"), D)
+
+    def design(self, x: Float) -> Float:
+        """Return d (-e) / d (the nine parameters of `observability`), shape (R, 11, 9), at x, shape (R, 9).
+
+        Of the compressed residuals. The chain runs over K_a = K_a0 (I + E)^-1, so dK_a = -K_a0 E, and dD_i = K_ii times
+        the bias as force.
+        """
+        K, _ = self.parameters(x)
+        chain = np.zeros((len(K), 9, 9))
+        for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+            change = np.zeros_like(K)
+            change[:, :, j] = -K[:, :, i] / self.g
+            chain[:, :, p] = pack(change, np.zeros((len(K), 3)), 9)
+        for i in range(3):
+            chain[:, 6 + i, 6 + i] = K[:, i, i]
+        design: Float = self.jacobian(x[:, None])[:, 0] / self.units[:, None, :] @ chain / (2.0 * self.g)
+        return design
+
+    def information(self, x: Float) -> Float:
+        """Return J^T J of the nine parameters, shape (R, 9, 9), at x, shape (R, 9), from the compressed readings."""
+        J = self.design(x)
+        information: Float = J.swapaxes(1, 2) @ J
+        return information
 
     def _quadratic(self, x: Float) -> Float:
         """Return the ten entries of Q = M^T M and -1, shape (R, 11, P), at x, shape (R, P, D)."""

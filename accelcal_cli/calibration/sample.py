@@ -4,16 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.io.fleet import Batch, FleetReadings
+from accelcal_cli.calibration.settings import Weights
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.io.screening import LOOKED_AT, RAW_ROWS, may_be_doubtful
 
+if TYPE_CHECKING:
+    from accelcal_cli.io.fleet import Batch, FleetReadings
+
 Blocks = Callable[[], Iterator[tuple[int, Float]]]
 """Yields (number of the first pose, outputs, shape (R, B, 3)) from the first pose on, as often as it is called."""
+
+NEEDS = {
+    "n": 'a column "n" or repeated readings per pose',
+    "sd": "standard deviations above zero (columns sx, sy, sz) or at least two readings per pose",
+    "auto": "the number of readings and their standard deviation (columns n, sx, sy, sz), or at least two readings "
+    "per pose",
+}
+"""What weights need to stand beside the readings, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,3 +132,48 @@ class Sample:
         """Return the same poses with other outputs, shape (R, J, 3)."""
         lower, upper = output.min(axis=1), output.max(axis=1)
         return replace(self, lower=lower, upper=upper, blocks=lambda: iter([(0, output)]))
+
+    def weights(self, choice: Weights) -> Float | None:
+        """Return the weights of the poses, mean 1 per sensor, 0 for repetitions, shape (R, J), or None for all alike.
+
+        n: how many raw readings a pose is the mean of; sd: those over the variance of one. Weights of a sensor whose
+        readings do not give them (see `without_weights`) mean nothing.
+        """
+        real = self.real(0, int(self.poses.max()))
+        if choice == "none" or self.count is None:
+            return None if real.all() else real.astype(float)
+        weights = self.count.astype(float)
+        if choice == "sd" and self.scatter is not None:
+            square = np.mean(self.scatter**2, axis=2)
+            weights = np.divide(weights, square, out=np.full(weights.shape, np.nan), where=square > 0)
+        weights = np.where(real, weights, 0.0)
+        mean: Float = weights.sum(axis=1, keepdims=True) / self.poses[:, None]
+        return weights / mean
+
+    def without_weights(self, choice: Weights) -> Bool:
+        """Return which sensors have readings that do not give the weights, shape (R,)."""
+        if choice == "none":
+            return np.zeros(len(self), dtype=bool)
+        count, scatter = self.count, self.scatter
+        if count is None or (choice != "n" and scatter is None):
+            return np.ones(len(self), dtype=bool)
+        usable: Bool = np.isfinite(count) & (count > 0)
+        if scatter is not None and choice != "n":
+            usable &= ~np.isnan(scatter).any(axis=2)
+            usable &= (choice == "auto") | (scatter > 0).any(axis=2)
+        return np.asarray((~usable & self.real(0, count.shape[1])).any(axis=1))
+
+    def explained(self, first: int, f: Float, K: Float) -> Float:
+        """Return the variance of the modulus that the scatter of each pose explains, (m/s^2)^2, shape (R, B), or NaN.
+
+        Args:
+            first: number of the first of B poses; f: their specific force, m/s^2, shape (R, B, 3).
+            K: of the sensors, output units per m/s^2, shape (R, 3, 3).
+        """
+        if self.scatter is None or self.count is None:
+            return np.full(f.shape[:2], np.nan)
+        part = slice(first, first + f.shape[1])
+        u = f / np.linalg.norm(f, axis=2, keepdims=True)
+        force = self.scatter[:, part] / np.einsum("rii->ri", K)[:, None, :]
+        variance: Float = np.sum((u * force) ** 2, axis=2) / self.count[:, part]
+        return variance

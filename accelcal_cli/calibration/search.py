@@ -14,16 +14,38 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.box import Start, search_box
-from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress, least_squares
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.calibration.observability import Observability
+from accelcal_cli.calibration.problem import (
+    Box,
+    Loetters,
+    Triangle,
+    compress,
+    fit_ellipsoid,
+    least_squares,
+    pack,
+)
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import NORMAL_MAD, explained, loss_weight, pose_weights
+from accelcal_cli.calibration.settings import BoxSettings, Robust, Settings
 from accelcal_cli.optimization.minimize import Run, minimize
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.sensor.model import to_gauge
+
+SHIFT = 0.5
+"""The box is moved off the closed form by up to this part of its half-width: the search finds the answer by
+itself, and the answer stays well inside."""
+
+SPHERE_PRIOR = 1e-3
+"""Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what axes
+whose scale factors differ by 3 % pretend to say about an axis that the poses do not turn through."""
+
+HUBER = 1.345
+"""Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
+
+NORMAL_MAD = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation."""
 
 SAME_MINIMUM = 1e-6
 """Two searches ended in the same minimum when their polished costs differ by at most this part."""
@@ -49,6 +71,28 @@ LEAST_SHARED = 0.01
 
 SLOPES = 6
 """Parameters more where scale factors and biases are linear in temperature."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where searches start.
+
+    Attributes:
+        box: the search box of each of R sensors, D = 6, 9 or 12.
+        sources: of each: "stated", "closed form" or "sphere".
+    """
+
+    box: Box
+    sources: tuple[str, ...]
+
+    @property
+    def source(self) -> str:
+        """That of the first sensor."""
+        return self.sources[0]
+
+    def take(self, index: Int) -> Start:
+        """Return the starts of the sensors at `index`."""
+        return Start(self.box.take(index), tuple(self.sources[i] for i in index))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +187,7 @@ def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
     if settings.weights == "auto":
         return _shared(sample, settings)
-    return _stated(sample, settings, pose_weights(sample, settings.weights))
+    return _stated(sample, settings, sample.weights(settings.weights))
 
 
 def _stated(sample: Sample, settings: Settings, weights: Float | None) -> Stated:
@@ -162,6 +206,79 @@ def packed(sample: Sample, weights: Float | None, within: Sample | None = None) 
         for first, block in sample.blocks()
     )
     return compress(blocks, centre, scale, sample.poses)
+
+
+def search_box(triangle: Triangle, settings: Settings) -> Start:
+    """Return the search box of each sensor; the same in any company.
+
+    Args:
+        triangle: the compressed readings of R sensors.
+        settings: stated nominal, half-widths, gauge, seed.
+    """
+    unknowns = 6 if not settings.misalignment else 12 if settings.gauge == "full" else 9
+    sensors = len(triangle.scale)
+    if settings.nominal is not None:
+        K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))
+        D = np.broadcast_to(settings.nominal.bias, (sensors, 3))
+        return Start(_box(K, D, settings, unknowns), ("stated",) * sensors)
+    K, D = _closed_form(triangle, settings.g)
+    index = np.flatnonzero(np.isfinite(K).all(axis=(1, 2)))
+    index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
+    closed = np.zeros(sensors, dtype=bool)
+    closed[index] = True
+    sphere_K, sphere_D = _sphere(triangle, settings.g)
+    if unknowns == 12:
+        # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
+        K[index] = to_gauge(K[index], "symmetric")
+    K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
+    box = _box(K, D, settings, unknowns)
+    u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
+    moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
+    return Start(
+        Box(np.where(closed[:, None], moved, box.centre), box.half),
+        tuple("closed form" if c else "sphere" for c in closed),
+    )
+
+
+def _box(K: Float, D: Float, settings: Settings, unknowns: int) -> Box:
+    half = half_widths(np.einsum("rii->ri", K), settings.box, settings.g, unknowns)
+    return Box(pack(K, D, unknowns), half)
+
+
+def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
+    K, d = fit_ellipsoid(triangle)
+    return K * triangle.scale[:, None, None] / g, d * triangle.scale[:, None] + triangle.centre
+
+
+def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> Bool:
+    """Whether the poses determine what the closed form says, shape (R,); where they do not, noise has decided it."""
+    problem = Loetters(triangle, settings.g, _box(K, D, settings, 9))
+    seen = Observability.of(problem.information(np.zeros((len(K), 9))), triangle.poses)
+    return np.array([verdict != "undetermined" for verdict in seen.verdicts], dtype=bool)
+
+
+def _sphere(triangle: Triangle, g: float) -> tuple[Float, Float]:
+    """Return K, shape (R, 3, 3), and D, shape (R, 3), of the spheres nearest to readings that fix no ellipsoid.
+
+    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant. A direction that the poses do not turn through
+    is held at the middle of the readings by the prior.
+    """
+    left, right = triangle.R[..., 6:10], triangle.R[..., :3].sum(axis=2)
+    transposed = left.swapaxes(1, 2)
+    prior = SPHERE_PRIOR * triangle.poses[:, None, None] * np.diag([1.0, 1.0, 1.0, 0.0])
+    c = np.linalg.solve(transposed @ left + prior, transposed @ right[..., None])[..., 0]
+    radius = np.sqrt(np.maximum(c[:, 3] + np.sum(c[:, :3] ** 2, axis=1), 0.0))
+    # Far from the readings' own extent, which is 1, it is noise.
+    radius = np.where((radius > 0.3) & (radius < 3.0), radius, 1.0)
+    K = (radius * triangle.scale / g)[:, None, None] * np.eye(3)
+    return K, c[:, :3] * triangle.scale[:, None] + triangle.centre
+
+
+def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Float:
+    """Return the half-widths in the units of the unknowns, shape (..., unknowns), for scale factors (..., 3)."""
+    mean = scale.mean(axis=-1, keepdims=True)
+    turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
+    return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
 
 
 def modulus_errors(sample: Sample, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
@@ -250,19 +367,6 @@ def polish(cost: Loetters, x: Float) -> Run:
     return minimize(cost, solver, runs=len(x), start=x[:, None, :], trace=False)
 
 
-def in_lower(cost: Loetters, K: Float, D: Float) -> tuple[Loetters, Float]:
-    """Return the nine-parameter problem of the same readings, and its point, shape (R, 9), for sensors K and D.
-
-    Uncertainty is always computed in gauge `lower`, whatever is searched or printed.
-    """
-    half = cost.box.half
-    # Any width: derivatives alone are asked for.
-    turned = half[:, 3:6] if cost.unknowns > 6 else half[:, :3]
-    half = np.concatenate([half[:, :3], turned, half[:, -3:]], axis=1)
-    nine = Loetters(cost.triangle, cost.g, Box(np.zeros((len(K), 9)), half))
-    return nine, nine.coordinates(to_gauge(K, "lower"), D)
-
-
 def reweight(solution: Solution) -> Solution:
     """Solve again under the robust loss, if there is one: weights from the residuals, residuals from the weights."""
     settings, sample = solution.stated.settings, solution.stated.sample
@@ -304,6 +408,20 @@ def _robust_blocks(
         yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
 
 
+def loss_weight(z: Float, loss: Robust) -> Float:
+    """Return the weight psi(z) / z of residuals z in units of the noise, same shape."""
+    if loss == "huber":
+        return HUBER / np.maximum(np.abs(z), HUBER)
+    return 1.0 / np.sqrt(1.0 + z * z)  # soft-L1: rho = 2 (sqrt(1 + z^2) - 1)
+
+
+def loss_slope(z: Float, loss: Robust) -> Float:
+    """Return psi'(z), same shape."""
+    if loss == "huber":
+        return (np.abs(z) <= HUBER).astype(float)
+    return (1.0 + z * z) ** -1.5
+
+
 def _shared(sample: Sample, settings: Settings) -> Stated:
     """State the problem with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
     stated = _stated(sample, settings, None)
@@ -315,8 +433,7 @@ def _shared(sample: Sample, settings: Settings) -> Stated:
         K, D = stated.cost.parameters(x)
         parts = list(modulus_errors(sample, K, D, settings.g))
         errors, force = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
-        u = force / np.linalg.norm(force, axis=2, keepdims=True)
-        own = explained(u, sample.scatter, sample.count, np.einsum("rii->ri", K))
+        own = sample.explained(0, force, K)
         shared = shared_variance(errors[0], own[0], int(sample.poses[0]) - 9)
         shared = max(shared, LEAST_SHARED * float(own.mean()))
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, WEAK
-from accelcal_cli.calibration.problem import ROWS_COLUMNS, Loetters
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK
+from accelcal_cli.calibration.problem import Loetters
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.search import SLOPES, Slopes, Solution, packed
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
@@ -33,7 +33,7 @@ def with_slopes(solution: Solution) -> Solution:
     One sensor; the parameters of a solution with slopes hold at the mean temperature.
     """
     sample, settings = solution.stated.sample, solution.stated.settings
-    if sample.temperature is None or not settings.temperature:
+    if sample.temperature is None:
         return solution
     degrees = sample.temperature[0]
     why = _unsuitable(solution, degrees)

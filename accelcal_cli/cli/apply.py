@@ -13,35 +13,41 @@ from accelcal_cli.errors import UsageError
 
 PARQUET = (".parquet", ".pq")
 
+in_force = options.panel("Specific force")
+
 
 def command(
-    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
-    data: Annotated[str, typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.")],
-    output: Annotated[
-        str, typer.Option("--output", "-o", help="Log to write, .parquet for Parquet; - is standard output.")
-    ] = "-",
+    result: options.ResultFile,
+    data: Annotated[
+        str,
+        typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.", rich_help_panel="Input"),
+    ],
     columns: options.Columns = None,
+    force: options.Force = False,
     unit: Annotated[
         str | None,
-        typer.Option(help="Unit of the specific force: m/s^2, g or mg.", show_default="the result's"),
+        in_force(
+            help="Unit of the specific force: {choices}.",
+            show_default="the result's",
+            autocompletion=options.one_of(options.UNITS),
+        ),
     ] = None,
     replace: Annotated[
         bool,
-        typer.Option(
-            "--replace", help="Write the force in place of the readings, not after the last column."
-        ),
+        in_force("--replace", help="Write the force in place of the readings, not after the last column."),
     ] = False,
-    prefix: Annotated[str, typer.Option(help="Name of the new columns, before x, y and z.")] = "f",
+    prefix: Annotated[str, in_force(help="Name of the new columns, before x, y and z.")] = "f",
     tilt: Annotated[
         bool,
-        typer.Option("--tilt", help="Add roll, pitch and their sigma, in degrees: for a sensor at rest."),
+        in_force("--tilt", help="Add roll, pitch and their sigma, in degrees: for a sensor at rest."),
     ] = False,
     noise: Annotated[
-        float, typer.Option(help="Noise of one row and axis, one sigma, m/s^2, for the sigma of --tilt.")
+        float, in_force(help="Noise of one row and axis, one sigma, m/s^2, for the sigma of --tilt.")
     ] = 0.0,
-    force: Annotated[
-        bool, typer.Option("--force", help="Use a result although its verdict is undetermined.")
-    ] = False,
+    output: Annotated[
+        str,
+        options.in_output("--output", "-o", help="Log to write, .parquet for Parquet; - is standard output."),
+    ] = "-",
     quiet: options.Quiet = False,
 ) -> None:
     """Apply a calibration to a log of any length.
@@ -72,7 +78,5 @@ def command(
         table.close()
     sys.stdout.flush()
     options.caution(data, log.formula.cautions(), quiet)
-    if not quiet:
-        notes = (*log.notes, *([] if output == "-" else [f"wrote {output}"]))
-        for note in notes:
-            typer.echo(f"accelcal: {note}", err=True)
+    options.tell(log.notes, quiet)
+    options.tell_written([output], quiet)

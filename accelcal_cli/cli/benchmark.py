@@ -8,10 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from accelcal_cli.cli import options
-from accelcal_cli.cli import options as running
+from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,51 +17,70 @@ if TYPE_CHECKING:
 
 MOST = 1_000_000_000
 
+in_problem, in_search = options.panel("Problem"), options.panel("Search")
+
+
+FUNCTIONS = (
+    "sphere",
+    "rosenbrock",
+    "rastrigin",
+    "griewank",
+    "modified-rosenbrock",
+    "ackley",
+    "schwefel",
+    "levy",
+    "zakharov",
+    "elliptic",
+    "styblinski-tang",
+)
+"""Names of studies.functions, stated again so that help need not import it; tests compare them."""
+
 
 def command(
+    *,
     func: Annotated[
         list[str] | None,
-        typer.Option(
+        in_problem(
             "--func",
-            help='Test functions: names with commas, repeated, or "all".',
+            help="Test functions, separated by commas or repeated: {choices}.",
             show_default="the four of the DE-PSO paper",
+            metavar="NAMES",
+            autocompletion=options.several_of((*FUNCTIONS, "all")),
         ),
     ] = None,
+    dim: Annotated[int, in_problem(help="Dimensions of the functions.", min=2, max=1000)] = 12,
+    shift: Annotated[bool, in_problem("--shift", help="Move the optimum off the centre.")] = False,
+    rotate: Annotated[bool, in_problem("--rotate", help="Rotate the coordinates.")] = False,
+    tolerance: Annotated[float, in_problem(help="A run succeeds with a cost at or below this.")] = 1e-8,
     optimizer: Annotated[
         list[str] | None,
-        typer.Option(
+        in_search(
             "--optimizer",
-            help='Optimizers: likewise; see "accelcal optimizers".',
+            help="Optimizers, separated by commas or repeated: {choices}.",
             show_default="pso,de,de-pso,shade-cma",
+            metavar="NAMES",
+            autocompletion=options.several_of(options.optimizers_or_all),
         ),
     ] = None,
-    dim: Annotated[int, typer.Option(help="Dimensions of the functions.", min=2, max=1000)] = 12,
-    runs: Annotated[int, typer.Option(help="Runs of each pair.", min=1, max=1_000_000)] = 20,
+    config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
-        int | None, typer.Option(help="Points of the search.", show_default="each optimizer's own", min=1)
+        int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(help="Iterations at most.", show_default="each optimizer's own", min=1)
+        int | None, in_search(help="Iterations at most.", show_default="each optimizer's own", min=1)
     ] = None,
     evaluations: Annotated[
         int | None,
-        typer.Option(
-            help="Budget of each run; iterations follow from it.", show_default="none", min=1, max=MOST
+        in_search(
+            help="Evaluations per run; iterations follow from them.", show_default="none", min=1, max=MOST
         ),
     ] = None,
-    seed: options.Seed = 0,
-    tolerance: Annotated[float, typer.Option(help="A run succeeds with a cost at or below this.")] = 1e-8,
-    stop: Annotated[bool, typer.Option("--stop", help="End a run that reaches the tolerance.")] = False,
-    shift: Annotated[bool, typer.Option("--shift", help="Move the optimum off the centre.")] = False,
-    rotate: Annotated[bool, typer.Option("--rotate", help="Turn the coordinates.")] = False,
-    config: Annotated[Path | None, typer.Option(help="YAML file: optimizers and their parameters.")] = None,
-    raw: running.Raw = None,
-    jobs: running.Jobs = 1,
-    cluster: running.Cluster = None,
-    resume: running.Resume = False,
+    stop: Annotated[bool, in_search("--stop", help="End a run that reaches the tolerance.")] = False,
+    runs: Annotated[int, running.in_runs(help="Runs per pair.", min=1, max=1_000_000)] = 20,
+    seed: running.Seed = 0,
     plot: running.Plot = None,
     format: options.Format = "table",
-    quiet: options.Quiet = False,
+    study_options: running.StudyOptions,
 ) -> None:
     """Run optimizers on test functions with known minima.
 
@@ -75,8 +91,7 @@ def command(
     from accelcal_cli.studies.functions import select
     from accelcal_cli.studies.study import ALL, Budget, choose, words
 
-    options.check_format(format)
-    options.check_apart([config], {"--raw": raw, "--plot": plot})
+    options.check_apart([config], {"--raw": study_options.raw, "--plot": plot})
     running.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
@@ -88,31 +103,23 @@ def command(
         tuple(entries), dim, runs, seed, tolerance, evaluations, stop, shift, rotate,
     )  # fmt: skip
     study, notes = study.suiting([] if ALL in named else [entry.label for entry in entries])
-    if not quiet:
-        for note in notes:
-            typer.echo(f"accelcal: {note}", err=True)
-    records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
+    options.tell(notes, study_options.quiet)
+    records = study_options.run(study)
     _show(study, records, format)
     if plot is not None:
         _plot(study, records, plot)
-    if not quiet:
-        for path in filter(None, (raw, plot)):
-            typer.echo(f"accelcal: wrote {path}", err=True)
+    options.tell_written([study_options.raw, plot], study_options.quiet)
 
 
 def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.benchmark import rank
-    from accelcal_cli.studies.study import median_curves
-    from accelcal_cli.views.studies import benchmark_blocks, benchmark_table, benchmark_title, ranking_table
+    from accelcal_cli.views.studies import benchmark_table
 
     rows = benchmark_table(study, records)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show
+        from accelcal_cli.studies.benchmark import rank
+        from accelcal_cli.studies.study import median_curves
+        from accelcal_cli.views.studies import benchmark_blocks, benchmark_title, ranking_table
 
         ranking = rank(study, records)
         further = [ranking_table(ranking)] if ranking else []

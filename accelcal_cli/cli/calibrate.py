@@ -3,94 +3,129 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import options as detecting
-from accelcal_cli.cli import process as pipes
+from accelcal_cli.cli import options, process
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.calibration.settings import Settings
 
 BAD_VERDICT = 1
 FACES = 6
-"""Poses at least of a log without --min-poses when no misalignment is asked for."""
+"""Fewest poses of a log without --min-poses when no misalignment is asked for."""
 SUFFIXES = (".yaml", ".yml", ".json")
 """Endings of a result file; they choose its form."""
 
+ROBUST = ("none", "huber", "soft-l1")
+ATTITUDES = ("unknown", "known")
 
-def command(
-    data: Annotated[
-        str,
-        typer.Argument(
-            help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input."
-        ),
-    ],
-    columns: options.Columns = None,
-    g: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
-    optimizer: Annotated[str | None, typer.Option(help="Search method.", show_default="de-pso")] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="YAML file: optimizer, its parameters, box, gauge, ...")
-    ] = None,
-    population: Annotated[int | None, typer.Option(help="Points of the search.")] = None,
-    iterations: Annotated[int | None, typer.Option(help="Iterations of the search.")] = None,
-    runs: Annotated[int | None, typer.Option(help="Independent searches (multi-start).")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.", show_default="0")] = None,
+in_model, in_search = options.panel("Model"), options.panel("Search")
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What is estimated, and how much each pose counts; keys of the settings."""
+
     gauge: Annotated[
-        str | None, typer.Option(help="lower, upper, symmetric or full.", show_default="lower")
-    ] = None,
-    robust: Annotated[
-        str | None, typer.Option(help="Loss: none, huber or soft-l1.", show_default="none")
-    ] = None,
-    weights: Annotated[
         str | None,
-        typer.Option(help="Weight of a pose: none, n, sd or auto.", show_default="none; auto with --raw"),
-    ] = None,
-    attitudes: Annotated[
-        str | None,
-        typer.Option(help="unknown, or known: from columns fx, fy, fz.", show_default="unknown"),
-    ] = None,
+        in_model(
+            help="Which of the equivalent matrices: {choices}.",
+            show_default="lower",
+            autocompletion=options.one_of(options.GAUGES),
+        ),
+    ] = None
     misalignment: Annotated[
         bool | None,
-        typer.Option(
+        in_model(
             help="Estimate misalignments; without, the axes are taken as perpendicular.",
             show_default="misalignment",
         ),
-    ] = None,
+    ] = None
     temperature: Annotated[
         bool | None,
-        typer.Option(
-            help="Slopes with temperature, if a column determines them.", show_default="temperature"
+        in_model(
+            help="Estimate temperature slopes, if a column determines them.", show_default="temperature"
+        ),
+    ] = None
+    attitudes: Annotated[
+        str | None,
+        in_model(
+            help="Attitudes of the poses: {choices} (from columns fx, fy, fz).",
+            show_default="unknown",
+            autocompletion=options.one_of(ATTITUDES),
+        ),
+    ] = None
+    weights: Annotated[
+        str | None,
+        in_model(
+            help="Weight of each pose: {choices}.",
+            show_default="none; auto with --raw",
+            autocompletion=options.one_of(options.WEIGHTS),
+        ),
+    ] = None
+    robust: Annotated[
+        str | None,
+        in_model(help="Loss: {choices}.", show_default="none", autocompletion=options.one_of(ROBUST)),
+    ] = None
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How the parameters are searched; keys of the settings, and parameters that most optimizers have."""
+
+    optimizer: Annotated[
+        str | None,
+        in_search(
+            help="Search method: {choices}.",
+            show_default="de-pso",
+            autocompletion=options.one_of(options.optimizers),
+        ),
+    ] = None
+    population: Annotated[int | None, in_search(help="Points of the search.")] = None
+    iterations: Annotated[int | None, in_search(help="Iterations of the search.")] = None
+    runs: Annotated[int | None, in_search(help="Independent searches (multi-start).")] = None
+    seed: Annotated[int | None, in_search(help="Seed of all random numbers.", show_default="0")] = None
+    polish: Annotated[
+        bool | None, in_search(help="Finish by Levenberg-Marquardt.", show_default="polish")
+    ] = None
+
+
+def command(
+    *,
+    data: Annotated[
+        str,
+        typer.Argument(
+            help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input.",
+            rich_help_panel="Input",
+        ),
+    ],
+    columns: options.Columns = None,
+    gravity: options.GravityOptions,
+    config: Annotated[
+        Path | None, options.in_input(help="YAML file: optimizer, its parameters, box, gauge, ...")
+    ] = None,
+    model: ModelOptions,
+    search: SearchOptions,
+    raw: Annotated[
+        bool,
+        options.in_log("--raw", help="The file is a raw log: find its static poses first, as detect does."),
+    ] = False,
+    log: options.DetectionOptions,
+    tolerance: Annotated[
+        float | None,
+        options.in_output(
+            help="Exit 1 when the rms of |f| - g is above this (m/s^2).", callback=options.check_tolerance
         ),
     ] = None,
-    polish: Annotated[
-        bool | None, typer.Option(help="Finish by Levenberg-Marquardt.", show_default="polish")
-    ] = None,
-    raw: Annotated[
-        bool, typer.Option("--raw", help="The file is a raw log: find its static poses first, see detect.")
-    ] = False,
-    gyro: detecting.Gyro = None,
-    time: detecting.Time = None,
-    rate: detecting.Rate = None,
-    window: detecting.Window = None,
-    still: detecting.Still = None,
-    multiplier: detecting.Multiplier = None,
-    min_length: detecting.MinLength = None,
-    trim: detecting.Trim = None,
-    merge: detecting.Merge = None,
-    thin: detecting.Thin = None,
-    min_poses: detecting.MinPoses = None,
-    tolerance: Annotated[
-        float | None, typer.Option(help="Exit 1 when the rms of |f| - g is above this (m/s^2).")
-    ] = None,
     output: Annotated[
-        str | None, typer.Option("--output", "-o", help="Result file: .yaml or .json; - is standard output.")
+        str | None,
+        options.in_output("--output", "-o", help="Result file: .yaml or .json; - is standard output."),
     ] = None,
     format: options.Format = "table",
     quiet: options.Quiet = False,
@@ -101,85 +136,58 @@ def command(
     Exit code 1 means that the verdict is "undetermined" or that --tolerance was missed.
     """
     from accelcal_cli.calibration.calibrate import calibrate
-    from accelcal_cli.calibration.settings import load_settings
-    from accelcal_cli.config import load_mapping
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
-    options.check_format(format)
     options.check_input(data)
     options.check_apart([data, config], {"-o": output})
     _check_output(output, format)
-    options.check_tolerance(tolerance)
-    stated_g = options.gravity(g, latitude, height)
-    overrides: dict[str, Any] = {
-        "optimizer": optimizer,
-        "g": stated_g,
-        "runs": runs,
-        "seed": seed,
-        "gauge": gauge,
-        "robust": robust,
-        "weights": weights,
-        "polish": polish,
-        "attitudes": attitudes,
-        "misalignment": misalignment,
-        "temperature": temperature,
-    }
-    parameters = {"population": population, "iterations": iterations}
-    stated = {k: v for k, v in overrides.items() if v is not None}
-    chosen = detecting.stated(
-        gyro=gyro,
-        time=time,
-        rate=rate,
-        window=window,
-        still=still,
-        multiplier=multiplier,
-        min_length=min_length,
-        trim=trim,
-        merge=merge,
-        thin=thin,
-        min_poses=min_poses,
-    )
-    if not raw and chosen:
-        raise UsageError(f"--{next(iter(chosen)).replace('_', '-')}: goes with --raw only")
+    stated_g = gravity.stated()
+    detection = options.stated(**vars(log))
+    if detection and not raw:
+        raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
+    stated = options.stated(**vars(model), **vars(search), g=stated_g)
+    stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
+    settings = _settings(config, stated, raw)
     if raw:
-        keys = {} if config is None else load_mapping(config)
-        aligned = {**keys, **stated}.get("misalignment") is False
-        if "weights" not in keys:
-            stated.setdefault("weights", "n" if aligned else "auto")
-        if aligned:
-            chosen.setdefault("min_poses", FACES)
-    stated["parameters"] = {k: v for k, v in parameters.items() if v is not None}
-    settings = load_settings(config, stated)
-    if raw:
-        readings = detecting.find_poses(data, columns, chosen, settings.g).readings()
+        if log.min_poses is None and not settings.misalignment:
+            log = replace(log, min_poses=FACES)
+        readings = log.detect(data, columns, settings.g).readings()
     else:
         readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     result = calibrate(readings, settings)
     missed = tolerance is not None and not result.rms <= tolerance
-    with pipes.even_if_unread():
+    with process.even_if_unread():
         _show(result, format, output)
-    with pipes.even_if_unread(sys.stderr):
-        if output not in (None, "-") and not quiet:
-            typer.echo(f"accelcal: wrote {output}", err=True)
+    with process.even_if_unread(sys.stderr):
+        options.tell_written([output], quiet)
         if format != "table" or output == "-":  # the table shows them itself
             options.caution(data, result.cautions, quiet)
-        if not quiet and stated_g is None and settings.g == STANDARD_GRAVITY:
-            typer.echo(
-                f"accelcal: g = {settings.g} assumed; state yours with --g or --latitude and --height "
-                f"(scale factors are proportional to it){_units_of_g(result)}",
-                err=True,
-            )
+        if stated_g is None and settings.g == STANDARD_GRAVITY:
+            options.tell_assumed_gravity(settings.g, quiet, _units_of_g(result))
         if tolerance is not None and missed:
-            typer.echo(f"accelcal: rms {result.rms:.6g} is above the tolerance {tolerance:.6g}", err=True)
+            options.tell([f"rms {result.rms:.6g} is above the tolerance {tolerance:.6g}"])
     if missed or result.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
+
+
+def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Settings:
+    """Return the settings; poses of a raw log are weighted unless the file says otherwise."""
+    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.config import load_mapping
+
+    if raw:
+        keys = {} if config is None else load_mapping(config)
+        if "weights" not in keys:
+            aligned = {**keys, **stated}.get("misalignment") is False
+            stated.setdefault("weights", "n" if aligned else "auto")
+    return load_settings(config, stated)
 
 
 def _units_of_g(result: Calibration) -> str:
     """Return what to say of readings that are 1 long and not 9.8: they were compared with m/s^2."""
     looks = 0.8 < float(result.nominal_scale.mean()) * result.g < 1.25
-    return "; readings in units of g, as these seem to be, go with --g 1" if looks else ""
+    return "; these readings seem to be in units of g: add --g 1" if looks else ""
 
 
 def _check_output(output: str | None, format: str) -> None:
@@ -198,24 +206,19 @@ def _check_output(output: str | None, format: str) -> None:
 
 def _show(result: Calibration, format: str, output: str | None) -> None:
     """Write the result file, then print the result in the chosen form."""
-    from accelcal_cli.output.machine import json_text, write_csv
-
     if output is not None:
         from accelcal_cli.config import dump
         from accelcal_cli.output.files import whole_file
+        from accelcal_cli.output.machine import json_text
 
         text = json_text(result.record()) if output.endswith(".json") else dump(result.record())
         with whole_file(output, binary=True) as file:  # read back as UTF-8, whatever the terminal takes
             file.write(text.encode())
         if output == "-":
             return
-    if format == "json":
-        sys.stdout.write(json_text(result.record()))
-    elif format == "csv":
-        from accelcal_cli.views.calibration import values
+    from accelcal_cli.views.calibration import values
 
-        write_csv(values(result), sys.stdout)
-    else:
+    if not options.print_data(format, result.record, lambda: values(result)):
         from accelcal_cli.output.console import show
         from accelcal_cli.views.calibration import blocks
 

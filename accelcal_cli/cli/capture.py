@@ -1,4 +1,4 @@
-"""`accelcal capture`: poses from a sensor that is being held, guided, into a table that calibrate reads."""
+"""`accelcal capture`: guided poses of a live sensor, into a table that calibrate reads."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import process as signals
+from accelcal_cli.cli import options, process
 from accelcal_cli.errors import AccelcalError, Interrupted, OutputError, UsageError
 
 if TYPE_CHECKING:
@@ -22,65 +21,67 @@ if TYPE_CHECKING:
 MOST_READINGS = 1_000_000
 INCOMPLETE = 1
 
+in_sensor, in_poses = options.panel("Sensor"), options.panel("Poses")
+
 
 def command(
-    port: Annotated[str, typer.Option(help="Serial port, as /dev/ttyUSB0 or COM3; - is standard input.")],
+    port: Annotated[str, options.in_input(help="Serial port, as /dev/ttyUSB0 or COM3; - is standard input.")],
     baud: Annotated[
-        int, typer.Option(help="Speed of the port, bits per second.", min=50, max=100_000_000)
+        int, options.in_input(help="Speed of the port, bits per second.", min=50, max=100_000_000)
     ] = 115200,
+    timeout: Annotated[float, options.in_input(help="Longest silence of the port, seconds.")] = 10.0,
     columns: Annotated[
-        str, typer.Option(help="Which numbers of a line are x, y and z, counted from 1, with commas.")
+        str,
+        options.in_input(help="Which numbers of a line are x, y and z, counted from 1, separated by commas."),
     ] = "1,2,3",
-    poses: Annotated[int, typer.Option(help="Poses to plan.", min=1, max=100)] = 12,
-    fixture: Annotated[
-        str, typer.Option(help="What the sensor can be held against: faces, edges or corners.")
-    ] = "corners",
-    rate: Annotated[float, typer.Option(help="Readings a second.")] = 100.0,
-    window: Annotated[float, typer.Option(help="Seconds that stillness is judged by.")] = 0.5,
-    hold: Annotated[float, typer.Option(help="Seconds of stillness that make a pose.")] = 2.0,
-    still: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest standard deviation of a still axis, output units.", show_default="1 % of 1 g"
-        ),
-    ] = None,
+    rate: Annotated[float, options.in_input(help="Readings per second.")] = 100.0,
     unit: Annotated[
         str | None,
-        typer.Option(
-            help="Output of 1 g: g, mg, m/s^2, or a number.", show_default="estimated from the poses"
+        in_sensor(
+            help="Output of 1 g: {choices}, or a number.",
+            show_default="estimated from the poses",
+            autocompletion=options.one_of(options.UNITS),
         ),
     ] = None,
     offset: Annotated[
         str | None,
-        typer.Option(
-            help="Output at no acceleration: three numbers with commas.",
+        in_sensor(
+            help="Output at no acceleration: three numbers separated by commas.",
             show_default="estimated from the poses",
         ),
     ] = None,
-    timeout: Annotated[float, typer.Option(help="Longest silence of the port, seconds.")] = 10.0,
-    output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Let the poses take the place of a file that exists.")
-    ] = False,
+    poses: Annotated[int, in_poses(help="Poses to plan.", min=1, max=100)] = 12,
+    fixture: Annotated[
+        str,
+        in_poses(
+            help="What the sensor can be held against: {choices}.",
+            autocompletion=options.one_of(options.FIXTURES[:-1]),
+        ),
+    ] = "corners",
+    window: Annotated[float, in_poses(help="Seconds that stillness is judged by.")] = 0.5,
+    hold: Annotated[float, in_poses(help="Seconds of stillness that make a pose.")] = 2.0,
+    still: Annotated[
+        float | None,
+        in_poses(help="Largest standard deviation of a still axis, output units.", show_default="1 % of 1 g"),
+    ] = None,
+    output: Annotated[str, options.in_output("--output", "-o", help="CSV file; - is standard output.")] = "-",
+    overwrite: Annotated[bool, options.in_output("--overwrite", help="Replace a file that exists.")] = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Take poses from a live sensor, guided.
 
-    Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged;
-    each is one row of the table for accelcal calibrate, written when it is taken. Ctrl-C, a closed terminal, the end
-    of the input and a lost port end it early; the poses taken until then are there. Exit code 1 means that the input
+    Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged into
+    one row of the table for accelcal calibrate, written at once. Ctrl-C, a closed terminal, the end of the input and a
+    lost port end it early; the poses taken until then are kept. Exit code 1 means that the input
     ended before all poses were taken.
     """
     from accelcal_cli.output.files import check_target, is_stream
-    from accelcal_cli.planning.design import FIXTURES
 
-    if fixture not in FIXTURES[:-1]:
-        raise UsageError(f'--fixture "{fixture}": expected one of {", ".join(FIXTURES[:-1])}')
+    options.check_choice("--fixture", fixture, options.FIXTURES[:-1])
     chosen = _columns(columns)
     for name, seconds in (("window", window), ("hold", hold), ("timeout", timeout), ("rate", rate)):
         options.check_positive(f"--{name}", seconds)
-    if still is not None:
-        options.check_positive("--still", still)
+    options.check_positive("--still", still)
     if max(window, hold) * rate > MOST_READINGS or window * rate < 2:
         raise UsageError(
             f"--window {window:g}, --hold {hold:g}, --rate {rate:g}: expected 2 to {MOST_READINGS:,} readings"
@@ -126,12 +127,12 @@ def _offset(text: str | None) -> Float | None:
     import numpy as np
 
     try:
-        found = np.array([float(word) for word in text.split(",")])
+        values = np.array([float(word) for word in text.split(",")])
     except ValueError:
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise UsageError(f'--offset "{text}": expected three numbers with commas')
-    return found
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise UsageError(f'--offset "{text}": expected three numbers separated by commas')
+    return values
 
 
 def _capture(
@@ -175,19 +176,18 @@ def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) 
             with Watch(capture, quiet=quiet) as watch:
                 _take(capture, readings, file, watch)
         except KeyboardInterrupt as stop:
-            ending = signals.interrupted(stop)
+            ending = process.interrupted(stop)
         except AccelcalError as error:
             ending = error
         try:
-            file.save(capture.taken, last=True)
+            file.save(capture.poses, last=True)
         except OutputError as error:
             ending = error
-    kept = _kept(capture, file)
+    summary = _summary(capture, file)
     if ending is not None:
-        ending.args = (f"{ending}; {kept}",)
+        ending.args = (f"{ending}; {summary}",)
         raise ending
-    if not quiet:
-        typer.echo(f"accelcal: {kept}", err=True)
+    options.tell([summary], quiet)
     if capture.missing():
         raise typer.Exit(INCOMPLETE)
 
@@ -199,16 +199,16 @@ def _take(capture: Capture, readings: Iterator[Float], file: PoseFile, watch: Wa
         if status is None:
             continue
         if status.state == "taken":
-            file.save(capture.taken)
+            file.save(capture.poses)
         watch.see(status)
         if status.state == "taken" and not capture.missing():
             return
 
 
-def _kept(capture: Capture, file: PoseFile) -> str:
+def _summary(capture: Capture, file: PoseFile) -> str:
     """Return what to say of the poses that are written."""
     if not file.kept:
-        parts = ["no pose was taken"] * (not capture.taken) + ["nothing is written"] * (not file.flows)
+        parts = ["no pose was taken"] * (not capture.poses) + ["nothing is written"] * (not file.flows)
         return ", ".join(parts) or "no pose is written"
     where = "" if file.path == "-" else f" in {file.path}"
     missing = len(capture.missing())

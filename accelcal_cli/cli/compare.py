@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import options as running
-from accelcal_cli.cli.simulate import LARGEST_NOISE
+from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -27,73 +26,120 @@ MOST_RUNS = 1_000_000
 MOST_POSITIONS = 1_000_000
 
 
+in_simulation, in_search = options.panel("Simulated sensors"), options.panel("Search")
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """The sensors that are simulated when no readings are given."""
+
+    sensor: Annotated[
+        str | None,
+        in_simulation(
+            help="Type of the sensors: {choices}, or a YAML file.",
+            show_default="mems",
+            autocompletion=options.one_of(partial(options.shipped, "sensors")),
+        ),
+    ] = None
+    fixed: Annotated[
+        bool, in_simulation("--fixed", help="The configured sensor in every run, none drawn.")
+    ] = False
+    positions: Annotated[
+        int | None, in_simulation(help="Number of poses.", show_default="12", max=MOST_POSITIONS)
+    ] = None
+    scheme: Annotated[
+        str | None,
+        in_simulation(
+            help="Where the poses point: {choices}.", autocompletion=options.one_of(options.SCHEMES[1:])
+        ),
+    ] = None
+    noise: Annotated[
+        float | None,
+        in_simulation(
+            help="Noise of one reading and axis, one sigma, m/s^2.",
+            show_default="the sensor's",
+            callback=options.check_noise,
+        ),
+    ] = None
+
+    def scenario(self) -> Simulation:
+        """Return what is simulated.
+
+        Raises:
+            UsageError: too few poses, or a scheme that does not fit their number.
+            ConfigError: no such type of sensor.
+        """
+        import numpy as np
+
+        from accelcal_cli.sensor.poses import directions
+        from accelcal_cli.sensor.simulation import load_sensor
+        from accelcal_cli.studies.scenarios import FEWEST, Simulation
+
+        count = 12 if self.positions is None else self.positions
+        if count < FEWEST:
+            raise UsageError(f"--positions {count}: nine parameters need at least {FEWEST} poses")
+        directions(count, self.scheme, np.ones((count, 3)))  # refuses a scheme that does not fit
+        device = load_sensor(self.sensor or "mems")
+        noise = device.noise if self.noise is None else self.noise
+        return Simulation(device, not self.fixed, count, self.scheme, noise)
+
+
 def command(
+    *,
     data: Annotated[
         str | None,
         typer.Argument(
-            help="Readings of one sensor to compare on instead of simulated ones; - is standard input."
+            help="Readings of one sensor to compare on instead of simulated ones; - is standard input.",
+            rich_help_panel="Input",
         ),
     ] = None,
-    columns: Annotated[
-        str | None, typer.Option(help="The three output columns of DATA: names, or numbers from 1.")
-    ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            help="Type of the simulated sensors: dpso, mems, navigation, or a file.", show_default="mems"
-        ),
-    ] = None,
-    fixed: Annotated[
-        bool, typer.Option("--fixed", help="The configured sensor in every run, none drawn.")
-    ] = False,
-    positions: Annotated[
-        int | None, typer.Option(help="Number of poses.", show_default="12", max=MOST_POSITIONS)
-    ] = None,
-    scheme: Annotated[
-        str | None,
-        typer.Option(help="faces-edges, edges, icosahedron, turns, fibonacci or random."),
-    ] = None,
-    noise: Annotated[
+    columns: options.Columns = None,
+    g: Annotated[
         float | None,
-        typer.Option(help="Noise of one reading and axis, one sigma, m/s^2.", show_default="the sensor's"),
+        options.in_input(
+            "--g", help="Local gravity in m/s^2 (1 for readings in units of g).", show_default="9.80665"
+        ),
     ] = None,
+    simulation: SimulationOptions,
     optimizer: Annotated[
         list[str] | None,
-        typer.Option(
+        in_search(
             "--optimizer",
-            help='Optimizers: names with commas, repeated, or "all".',
+            help="Optimizers, separated by commas or repeated: {choices}.",
             show_default=",".join(DEFAULT),
+            metavar="NAMES",
+            autocompletion=options.several_of(options.optimizers_or_all),
         ),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file: optimizers and their parameters.")] = None,
+    config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
-        int | None, typer.Option(help="Points of the search.", show_default="each optimizer's own", min=1)
+        int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(help="Iterations at most.", show_default="each optimizer's own", min=1)
+        int | None, in_search(help="Iterations at most.", show_default="each optimizer's own", min=1)
     ] = None,
-    runs: Annotated[int, typer.Option(help="Runs of each optimizer.", min=1, max=MOST_RUNS)] = 20,
-    gauge: Annotated[str, typer.Option(help="What is searched: lower (9 unknowns) or full (12).")] = "lower",
-    g: options.Gravity = None,
+    gauge: Annotated[
+        str,
+        in_search(
+            help="What is searched: {choices} (9 or 12 unknowns).", autocompletion=options.one_of(UNKNOWNS)
+        ),
+    ] = "lower",
     polish: Annotated[
         bool,
-        typer.Option(
+        in_search(
             "--polish/--no-polish",
             help="Finish every search by Levenberg-Marquardt.",
             show_default="no-polish",
         ),
     ] = False,
     tolerance: Annotated[
-        float, typer.Option(help="A run succeeds within this of the least cost, (m/s^2)^4, or within 1 %.")
+        float, in_search(help="A run succeeds within this of the least cost, (m/s^2)^4, or within 1 %.")
     ] = 1e-10,
-    seed: options.Seed = 0,
-    raw: running.Raw = None,
-    jobs: running.Jobs = 1,
-    cluster: running.Cluster = None,
-    resume: running.Resume = False,
+    runs: Annotated[int, running.in_runs(help="Runs per optimizer.", min=1, max=MOST_RUNS)] = 20,
+    seed: running.Seed = 0,
     plot: running.Plot = None,
     format: options.Format = "table",
-    quiet: options.Quiet = False,
+    study_options: running.StudyOptions,
 ) -> None:
     """Compare optimizers on the same calibrations.
 
@@ -105,35 +151,27 @@ def command(
     from accelcal_cli.studies.scenarios import SearchSpace
     from accelcal_cli.studies.study import Budget, choose, words
 
-    options.check_format(format)
+    sensor = simulation.sensor
     type_file = sensor if sensor is not None and Path(sensor).suffix else None
-    options.check_apart([data, config, type_file], {"--raw": raw, "--plot": plot})
+    options.check_apart([data, config, type_file], {"--raw": study_options.raw, "--plot": plot})
     running.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
-    space = SearchSpace(options.gravity(g, None, None) or STANDARD_GRAVITY, _unknowns(gauge))
+    space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, _unknowns(gauge))
     entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
-    if data is None:
-        source: Simulation | Recording = _simulated(sensor, positions, scheme, noise, fixed, columns)
+    source: Simulation | Recording
+    if data is not None:
+        source = _recorded(data, columns, space.g, simulation)
+    elif columns is not None:
+        raise UsageError("--columns needs a file of readings")
     else:
-        stated = {
-            "--sensor": sensor,
-            "--fixed": fixed or None,
-            "--positions": positions,
-            "--scheme": scheme,
-            "--noise": noise,
-        }
-        source = _recorded(
-            data, columns, space.g, [option for option, value in stated.items() if value is not None]
-        )
+        source = simulation.scenario()
     study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
-    records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
+    records = study_options.run(study)
     _show(study, records, format)
     if plot is not None:
         _plot(study, records, plot)
-    if not quiet:
-        for path in filter(None, (raw, plot)):
-            typer.echo(f"accelcal: wrote {path}", err=True)
+    options.tell_written([study_options.raw, plot], study_options.quiet)
 
 
 def _unknowns(gauge: str) -> int:
@@ -145,55 +183,25 @@ def _unknowns(gauge: str) -> int:
     return UNKNOWNS[gauge]
 
 
-def _simulated(
-    sensor: str | None,
-    positions: int | None,
-    scheme: str | None,
-    noise: float | None,
-    fixed: bool,
-    columns: str | None,
-) -> Simulation:
-    from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import load_sensor
-    from accelcal_cli.studies.scenarios import FEWEST, Simulation
-
-    if columns is not None:
-        raise UsageError("--columns: needs a file of readings")
-    if noise is not None and not 0 <= noise <= LARGEST_NOISE:
-        raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
-    count = 12 if positions is None else positions
-    if count < FEWEST:
-        raise UsageError(f"--positions {count}: nine parameters need at least {FEWEST} poses")
-    import numpy as np
-
-    directions(count, scheme, np.ones((count, 3)))  # refuses a scheme that does not fit
-    device = load_sensor(sensor or "mems")
-    return Simulation(device, not fixed, count, scheme, device.noise if noise is None else noise)
-
-
-def _recorded(data: str, columns: str | None, g: float, simulation: Sequence[str]) -> Recording:
+def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOptions) -> Recording:
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.studies.scenarios import Recording
 
-    if simulation:
-        raise UsageError(f"{', '.join(simulation)}: not with a file of readings, which are not simulated")
+    stated = [f"--{name}" for name, value in options.stated(**vars(simulation)).items() if value is not False]
+    if stated:
+        raise UsageError(f"{', '.join(stated)}: not with a file of readings, which are not simulated")
     options.check_input(data)
-    chosen = None if columns is None else [part.strip() for part in columns.split(",")]
-    return Recording.of(read_readings(data, chosen, stdin=sys.stdin.buffer), g)
+    return Recording.of(read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer), g)
 
 
 def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.study import median_curves
-    from accelcal_cli.views.experiments import comparison_conditions, comparison_subject, comparison_table
+    from accelcal_cli.views.experiments import comparison_table
 
     rows = comparison_table(study, records)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show
+        from accelcal_cli.studies.study import median_curves
+        from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
         from accelcal_cli.views.studies import study_blocks
 
         panels = median_curves(study, records)

@@ -2,69 +2,92 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 import sys
-from typing import Annotated
-
-import typer
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from accelcal_cli.cli import options
 from accelcal_cli.errors import UsageError
 
-NAMES = "px4, ardupilot, kalibr, imucal, ros, c-header or numpy"
+if TYPE_CHECKING:
+    from accelcal_cli.exporters.base import Exporter
+
+in_format = options.panel("Format")
+
+
+def _takers() -> dict[str, dict[str, type[Exporter]]]:
+    """Return the exporters that take an option, by option and name."""
+    from accelcal_cli.exporters.base import EXPORTERS
+
+    takers: dict[str, dict[str, type[Exporter]]] = {}
+    for name in EXPORTERS.names():
+        cls = EXPORTERS.get(name)
+        for field in dataclasses.fields(cls):
+            takers.setdefault(field.name, {})[name] = cls
+    return takers
+
+
+def format_options() -> type:
+    """Return the group of all options of exporters, each once; the help names the exporters that take it."""
+    fields = []
+    for option, classes in _takers().items():
+        cls = next(iter(classes.values()))
+        (field,) = (field for field in dataclasses.fields(cls) if field.name == option)
+        doc = field.metadata["doc"]
+        default = False if field.default is None else str(field.default)
+        flag = f"--{option.replace('_', '-')}"
+        hint: Any = Annotated[
+            get_type_hints(cls)[option] | None,
+            in_format(flag, help=f"{doc[0].upper()}{doc[1:]} ({', '.join(classes)}).", show_default=default),
+        ]
+        fields.append((option, hint, dataclasses.field(default=None)))
+    return dataclasses.make_dataclass("FormatOptions", fields, frozen=True)
 
 
 def command(
-    result: Annotated[str, typer.Argument(help="Result file of accelcal calibrate; - is standard input.")],
-    to: Annotated[str, typer.Option(help=f"Format: {NAMES}.", metavar="FORMAT")],
-    output: Annotated[str, typer.Option("--output", "-o", help="File to write; - is standard output.")] = "-",
-    instance: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of the accelerometer in the target (px4, ardupilot, kalibr).",
-            min=0,
-            show_default="0",
+    result: options.ResultFile,
+    to: Annotated[
+        str,
+        in_format(
+            "--to",
+            help="Format: {choices}.",
+            metavar="FORMAT",
+            autocompletion=options.one_of(options.exporters),
         ),
-    ] = None,
-    driver_scale: Annotated[
-        float | None,
-        typer.Option(
-            help="Output units that the target's driver takes for 1 m/s^2 (px4, ardupilot, kalibr)."
-        ),
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Use a result although its verdict is undetermined.")
-    ] = False,
+    ],
+    target: Annotated[Any, format_options],
+    output: Annotated[
+        str, options.in_output("--output", "-o", help="File to write; - is standard output.")
+    ] = "-",
+    force: options.Force = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Write a result in the format of another tool.
 
     Warns of what the format cannot hold. PX4 and ArduPilot have no misalignments.
     """
-    from accelcal_cli.exporters.base import Target
-    from accelcal_cli.exporters.formats import check_name, check_options, export
+    from accelcal_cli.exporters.base import EXPORTERS
     from accelcal_cli.output.files import check_target, whole_file
 
-    check_name(to)
-    stated = {"--instance": instance, "--driver-scale": driver_scale}
-    check_options(to, [option for option, value in stated.items() if value is not None])
-    if driver_scale is not None and not (math.isfinite(driver_scale) and driver_scale > 0):
-        raise UsageError(f"--driver-scale {driver_scale:g}: expected a positive number")
+    cls = EXPORTERS.get(to)
+    stated = options.stated(**vars(target))
+    for option in stated:
+        takers = _takers()[option]
+        if to not in takers:
+            raise UsageError(
+                f"--{option.replace('_', '-')} does not apply to --to {to}; it applies to {', '.join(takers)}"
+            )
+    exporter = EXPORTERS.build(to, stated, f"--to {to}")
     options.check_apart([result], {"-o": output})
     check_target(output)
-    if to == "numpy" and output == "-" and sys.stdout.isatty():
-        raise UsageError("--to numpy is no text for a terminal; name a file with -o")
+    if cls.binary and output == "-" and sys.stdout.isatty():
+        raise UsageError(f"--to {to} is not text for a terminal; name a file with -o")
     calibration = options.load_result(result)
     calibration.check_determined(result, force=force)
     options.caution(result, calibration.cautions, quiet)
-    made = export(calibration, to, Target(instance or 0, driver_scale))
+    export = exporter.export(calibration)
     with whole_file(output, binary=True) as file:
-        file.write(made.content)
+        file.write(export.content)
     sys.stdout.flush()
-    if not quiet:
-        notes = (
-            *(f"warning: {text}" for text in made.warnings),
-            *([] if output == "-" else [f"wrote {output}"]),
-        )
-        for note in notes:
-            typer.echo(f"accelcal: {note}", err=True)
+    options.tell((f"warning: {text}" for text in export.warnings), quiet)
+    options.tell_written([output], quiet)

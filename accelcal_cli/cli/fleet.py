@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import process as pipes
+from accelcal_cli.cli import options, process
 from accelcal_cli.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
@@ -26,38 +25,56 @@ NAMED = 5
 """Sensors that a line on standard error names."""
 
 
+in_model = options.panel("Model")
+
+
 def command(
+    *,
     data: Annotated[
         list[str],
         typer.Argument(
-            help="Table of static readings with a column that labels the sensor, or one file a sensor; CSV, text or "
-            "Parquet; - is standard input."
+            help="Table of static readings with a column that labels the sensor, or one file per sensor; CSV, text or "
+            "Parquet; - is standard input.",
+            rich_help_panel="Input",
         ),
     ],
     sensor_column: Annotated[
         str | None,
-        typer.Option(
+        options.in_input(
             help="Column that labels the sensor: name, or number from 1.", show_default="found by name"
         ),
     ] = None,
     columns: options.Columns = None,
-    g: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file: box, nominal, gauge, weights, g.")] = None,
+    gravity: options.GravityOptions,
+    config: Annotated[
+        Path | None, options.in_input(help="YAML file: box, nominal, gauge, weights, g.")
+    ] = None,
     gauge: Annotated[
-        str | None, typer.Option(help="lower, upper or symmetric.", show_default="lower")
+        str | None,
+        in_model(
+            help="Which of the equivalent matrices: {choices}.",
+            show_default="lower",
+            autocompletion=options.one_of(options.GAUGES[:-1]),
+        ),
     ] = None,
     weights: Annotated[
-        str | None, typer.Option(help="Weight of a pose: none, n or sd.", show_default="none")
+        str | None,
+        in_model(
+            help="Weight of each pose: {choices}.",
+            show_default="none",
+            autocompletion=options.one_of(options.WEIGHTS[:-1]),
+        ),
     ] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="Exit 1 when the rms of |f| - g of a sensor is above this (m/s^2)."),
+        options.in_output(
+            help="Exit 1 when the rms of |f| - g of a sensor is above this (m/s^2).",
+            callback=options.check_tolerance,
+        ),
     ] = None,
     output: Annotated[
         str | None,
-        typer.Option(
+        options.in_output(
             "--output",
             "-o",
             help="Table of all sensors, .csv, .parquet or .json; or a folder, ending in /, for a result file of each.",
@@ -78,18 +95,16 @@ def command(
     from accelcal_cli.io.fleet import read_fleet
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
-    options.check_format(format)
     for source in data:
         options.check_input(source)
-    options.check_tolerance(tolerance)
     options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
-    stated_g = options.gravity(g, latitude, height)
-    stated: dict[str, Any] = {"g": stated_g, "gauge": gauge, "weights": weights}
+    stated_g = gravity.stated()
+    stated = options.stated(g=stated_g, gauge=gauge, weights=weights)
     filed = {} if config is None else load_mapping(config)
     if "optimizer" not in filed:
         stated["optimizer"] = "levenberg-marquardt"
-    settings = load_settings(config, {k: v for k, v in stated.items() if v is not None})
+    settings = load_settings(config, stated)
     if filed.get("temperature") is True:  # the default asks for nothing, a file does
         raise ConfigError(
             f"{config}: temperature: true: a fleet goes without slopes; calibrate this sensor by itself"
@@ -100,13 +115,14 @@ def command(
         fleet = _with_results(readings, settings, output)
     else:
         fleet = calibrate_fleet(readings, settings)
-    with pipes.even_if_unread():
+    with process.even_if_unread():
         _show(fleet, readings, settings, format, None if folder else output)
     bad = _bad(fleet, tolerance)
-    with pipes.even_if_unread(sys.stderr):
-        if not quiet:
-            assumed = stated_g is None and settings.g == STANDARD_GRAVITY
-            _tell(readings, output, settings.g if assumed else None)
+    with process.even_if_unread(sys.stderr):
+        options.tell(dict.fromkeys(note for origin in readings.origins for note in origin.notes), quiet)
+        if stated_g is None and settings.g == STANDARD_GRAVITY:
+            options.tell_assumed_gravity(settings.g, quiet)
+        options.tell_written([output], quiet)
         _name(bad, readings.sensors)
     if any(which.any() for which in bad.values()):
         raise typer.Exit(BAD_VERDICT)
@@ -133,44 +149,26 @@ def _with_results(readings: FleetReadings, settings: Settings, output: str) -> F
     from accelcal_cli.output.files import whole_folder
     from accelcal_cli.output.machine import write_result
 
-    with whole_folder(output) as made:
+    with whole_folder(output) as folder:
         return calibrate_fleet(
-            readings, settings, lambda number, result: write_result(made, readings.sensors[number], result)
+            readings, settings, lambda number, result: write_result(folder, readings.sensors[number], result)
         )
 
 
 def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
     from accelcal_cli.calibration.fleet import standouts
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv, write_table
+    from accelcal_cli.output.machine import write_table
     from accelcal_cli.views import fleet as fleet_tables
 
-    found = standouts(fleet, settings.g)
-    rows = fleet_tables.sensors(fleet, readings.sensors, found)
+    outlying = standouts(fleet, settings.g)
+    rows = fleet_tables.sensors(fleet, readings.sensors, outlying)
     if output is not None:
         write_table(rows, output)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    else:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show
 
-        show(fleet_tables.blocks(fleet, readings.sensors, found, settings.g))
-
-
-def _tell(readings: FleetReadings, output: str | None, assumed: float | None) -> None:
-    """Say on standard error what was read, assumed and written."""
-    notes = list(dict.fromkeys(note for origin in readings.origins for note in origin.notes))
-    if assumed is not None:
-        notes.append(
-            f"g = {assumed} assumed; state yours with --g or --latitude and --height "
-            "(scale factors are proportional to it)"
-        )
-    if output is not None:
-        notes.append(f"wrote {output}")
-    for note in notes:
-        typer.echo(f"accelcal: {note}", err=True)
+        show(fleet_tables.blocks(fleet, readings.sensors, outlying, settings.g))
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:
@@ -188,4 +186,4 @@ def _name(bad: Mapping[str, Bool], labels: Sequence[str]) -> None:
         if names:
             more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
             count = f"{len(names):,} of {len(labels):,} sensors"
-            typer.echo(f"accelcal: {count} {what}: {', '.join(names[:NAMED])}{more}", err=True)
+            options.tell([f"{count} {what}: {', '.join(names[:NAMED])}{more}"])

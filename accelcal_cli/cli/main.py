@@ -16,8 +16,7 @@ import typer.core
 import typer.main
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import process as pipes
-from accelcal_cli.cli import process as signals
+from accelcal_cli.cli import options, process
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -49,23 +48,45 @@ NAMES = (
 )
 """The commands in the order of the help page; each is the function `command` of the module of its name."""
 
-HOUSE: dict[str, Any] = {
+STYLE: dict[str, Any] = {
     "pretty_exceptions_enable": False,
     "rich_markup_mode": None,
     "context_settings": {"help_option_names": ["-h", "--help"]},
 }
-"""What the program and every command of it are made with."""
+"""What the program and every command of it are made with; help without rich, whose import takes as long as all else."""
 
 
 @cache
 def _build(name: str) -> Any:
     """Return the parsed form of one command."""
-    alone = typer.Typer(add_completion=False, **HOUSE)
-    alone.command(name)(import_module(f"accelcal_cli.cli.{name}").command)
+    alone = typer.Typer(add_completion=False, **STYLE)
+    alone.command(name, cls=Command)(options.expand(_function(name)))
     return typer.main.get_command(alone)
 
 
-class Made(Mapping[str, Any]):
+def _function(name: str) -> Any:
+    return import_module(f"accelcal_cli.cli.{name}").command
+
+
+class Command(typer.core.TyperCommand):
+    """A command whose help has its options under the headings of their panels, with their choices."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write a list for each panel, in the order of their first options; what has no panel comes last."""
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                names, text = record
+                heading = getattr(parameter, "rich_help_panel", None) or "Options"
+                row = names, options.help_text(parameter, ctx, text)
+                panels.setdefault(heading, []).append(row)
+        for heading, rows in panels.items():
+            with formatter.section(heading):
+                formatter.write_dl(rows)
+
+
+class LazyCommands(Mapping[str, Any]):
     """The commands by name, each imported and built when it is asked for: a calibration pays for no other."""
 
     def __getitem__(self, name: str) -> Any:
@@ -89,14 +110,19 @@ class Commands(typer.core.TyperGroup):
     def __init__(self, **attributes: Any) -> None:
         """Make the group of all commands."""
         super().__init__(**attributes)
-        self.commands = Made()  # type: ignore[assignment]  # only ever read
+        self.commands = LazyCommands()  # type: ignore[assignment]  # only ever read
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002  # typer's signature
+        """Write the commands, each with the first line of its docstring, without building any."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, _function(name).__doc__.partition("\n")[0]) for name in NAMES])
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; leave quietly when the reader of its output has gone."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as stop:
-            raise signals.interrupted(stop) from None
+            raise process.interrupted(stop) from None
         except BrokenPipeError:
             _leave_pipe()
 
@@ -106,7 +132,7 @@ app = typer.Typer(
     cls=Commands,
     help="Calibrate three-axis accelerometers without a turntable.",
     no_args_is_help=True,
-    **HOUSE,
+    **STYLE,
 )
 
 
@@ -117,7 +143,7 @@ def _version(wanted: bool) -> None:
 
 
 @app.callback()
-def options(
+def program(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
     ] = False,
@@ -129,7 +155,7 @@ def main() -> None:
     """Run the command line; exit 0 done, 1 done with a bad verdict, 2 bad input, 128 + n by signal n."""
     _open_streams()
     try:
-        with signals.raised():
+        with process.raised():
             code = app(prog_name="accelcal", standalone_mode=False)
     except AccelcalError as error:
         _fail(str(error), BAD_INPUT)
@@ -144,7 +170,7 @@ def main() -> None:
     except OSError as error:
         if error.errno == errno.EPIPE:
             _leave_pipe()
-        pipes.drop(sys.stdout)
+        process.drop(sys.stdout)
         _fail(f"cannot write: {(error.strerror or str(error)).lower()}", BAD_INPUT)
     except MemoryError:
         _fail("not enough memory for this input", BAD_INPUT)
@@ -177,11 +203,11 @@ def _fail(message: str, code: int) -> NoReturn:
     try:
         typer.echo(f"accelcal: {message}", err=True)
     except OSError:  # a terminal that is gone
-        pipes.drop(sys.stderr)
+        process.drop(sys.stderr)
     sys.exit(code)
 
 
 def _leave_pipe() -> NoReturn:
     """Leave quietly when the reader of our output has gone, as `head` does."""
-    pipes.drop(sys.stdout)
+    process.drop(sys.stdout)
     sys.exit(0)

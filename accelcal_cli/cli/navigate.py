@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from accelcal_cli.cli import options
-from accelcal_cli.cli import options as running
-from accelcal_cli.errors import UsageError, did_you_mean
+from accelcal_cli.cli import options, running
+from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.navigation.ins import InsGrade
@@ -20,97 +17,105 @@ if TYPE_CHECKING:
     from accelcal_cli.studies.study import Record
 
 MODES = ("default", "literal", "both")
+MAPS = ("rough", "moderate", "constant")
 ALL = "all"
 
-Plot = Annotated[
-    str | None,
-    typer.Option("--plot", help="Draw map, track and RMSE to a .png or .svg file.", metavar="FILE"),
-]
+in_filters, in_voyage = options.panel("Filters"), options.panel("Voyage")
+
+
+def filters_or_all() -> list[str]:
+    """Return the names of the filters, and "all"."""
+    return [*options.filters(), ALL]
 
 
 def command(
+    *,
     filter: Annotated[
         list[str] | None,
-        typer.Option(
+        in_filters(
             "--filter",
-            help='pf, de-pf, pso-pf, apo-pf, reference: names with commas, repeated, or "all".',
+            help="Filters, separated by commas or repeated: {choices}.",
             show_default="all, or the file's",
+            metavar="NAMES",
+            autocompletion=options.several_of(filters_or_all),
         ),
     ] = None,
     mode: Annotated[
         str | None,
-        typer.Option(help="default, literal (as the paper prints it) or both.", show_default="default"),
+        in_filters(
+            help="{choices}; literal is as the paper prints it.",
+            show_default="default",
+            autocompletion=options.one_of(MODES),
+        ),
     ] = None,
-    runs: Annotated[int | None, typer.Option(help="Runs.", min=1, max=100_000, show_default="20")] = None,
     particles: Annotated[
-        int | None, typer.Option(help="Particles.", min=4, max=1_000_000, show_default="100")
+        int | None, in_filters(help="Particles.", min=4, max=1_000_000, show_default="100")
     ] = None,
     generations: Annotated[
-        int | None, typer.Option(help="Generations of the evolution.", min=0, max=1000, show_default="20")
-    ] = None,
-    period: Annotated[
-        float | None, typer.Option(help="Seconds between measurements.", show_default="10")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Seed of all random numbers.", min=0, show_default="0")
+        int | None, in_filters(help="Generations of the evolution.", min=0, max=1000, show_default="20")
     ] = None,
     map: Annotated[
         str | None,
-        typer.Option(
+        in_voyage(
             "--map",
-            help="rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, XYZ text.",
+            help="{choices} (generated), or a file: NetCDF, GeoTIFF, XYZ text.",
             show_default="rough",
+            autocompletion=options.one_of(MAPS),
         ),
     ] = None,
     voyage: Annotated[
-        str | None, typer.Option(help="CSV file of a recorded voyage.", show_default="a planned one")
+        str | None, in_voyage(help="CSV file of a recorded voyage.", show_default="a planned one")
+    ] = None,
+    period: Annotated[
+        float | None, in_voyage(help="Seconds between measurements.", show_default="10")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="YAML file: voyage, INS, map, filters and their parameters.")
+        Path | None, in_voyage(help="YAML file: voyage, INS, map, filters and their parameters.")
     ] = None,
     calibration: Annotated[
         str | None,
-        typer.Option(
+        in_voyage(
             help="Result of accelcal calibrate: its bias sigma, beside the INS without it; - is standard input."
         ),
     ] = None,
+    runs: Annotated[int | None, running.in_runs(help="Runs.", min=1, max=100_000, show_default="20")] = None,
+    seed: Annotated[
+        int | None, running.in_runs(help="Seed of all random numbers.", min=0, show_default="0")
+    ] = None,
     output: Annotated[
         str | None,
-        typer.Option("--output", "-o", help="CSV file for RMSE against time; - is standard output."),
+        options.in_output("--output", "-o", help="CSV file for RMSE against time; - is standard output."),
     ] = None,
-    raw: running.Raw = None,
-    jobs: running.Jobs = 1,
-    cluster: running.Cluster = None,
-    resume: running.Resume = False,
-    plot: Plot = None,
+    plot: Annotated[
+        str | None,
+        options.in_output("--plot", help="Draw map, track and RMSE to a .png or .svg file.", metavar="FILE"),
+    ] = None,
     format: options.Format = "table",
-    quiet: options.Quiet = False,
+    study_options: running.StudyOptions,
 ) -> None:
     """Navigate by inertia and gravity, simulated or recorded.
 
-    Prints the position error over hours 3 to 8, the least that any filter could have (the posterior Cramer-Rao bound),
-    how many runs lost lock, and whether the claimed spread fits the error (NEES, 2 when it does).
+    Prints the position error over hours 3 to 8, the smallest that any filter could have (the posterior Cramer-Rao
+    bound), how many runs lost lock, and whether the claimed spread fits the error (NEES, 2 when it does).
     """
-    options.check_format(format)
     running.check_plot(plot)
     _check(mode, output, format)
-    stated = {"map": map, "voyage": voyage, "period": period}
-    settings = {"particles": particles, "generations": generations}
-    study = _study(config, stated, filter or (), mode, settings, runs, seed, calibration)
+    setting = options.stated(map=map, voyage=voyage, period=period)
+    limits = {"particles": particles, "generations": generations}
+    repeats = options.stated(runs=runs, seed=seed)
+    study = _study(config, {**setting, **repeats}, filter or (), mode, limits, calibration)
     inputs = [config, calibration, *study.settings.files()]
-    options.check_apart(inputs, {"-o": output, "--raw": raw, "--plot": plot})
-    records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
-    show(study, records, format if output != "-" else "")
-    written = [path for path in (raw, output, plot) if path not in (None, "-")]
+    options.check_apart(inputs, {"-o": output, "--raw": study_options.raw, "--plot": plot})
+    records = study_options.run(study)
+    if output != "-":
+        _show(study, records, format)
     _write(study, records, output, plot)
-    if not quiet:
-        for path in written:
-            typer.echo(f"accelcal: wrote {path}", err=True)
+    options.tell_written([study_options.raw, output, plot], study_options.quiet)
 
 
 def _check(mode: str | None, output: str | None, format: str) -> None:
-    if mode is not None and mode not in MODES:
-        raise UsageError(f'--mode "{mode}"{did_you_mean(mode, MODES)}; expected one of {", ".join(MODES)}')
+    if mode is not None:
+        options.check_choice("--mode", mode, MODES)
     if output is None:
         return
     if output == "-" and format != "table":
@@ -122,28 +127,26 @@ def _check(mode: str | None, output: str | None, format: str) -> None:
 
 def _study(
     config: Path | None,
-    stated: dict[str, Any],
+    stated: Mapping[str, Any],
     names: Sequence[str],
     mode: str | None,
-    settings: dict[str, Any],
-    runs: int | None,
-    seed: int | None,
+    limits: Mapping[str, Any],
     calibration: str | None,
 ) -> Navigation:
     """Return the study that file and command line state together."""
     from accelcal_cli.navigation.study import Navigation, load_study
     from accelcal_cli.studies.study import words
 
-    filed = load_study(config, {**stated, "runs": runs, "seed": seed})
-    entries = _entries(words(names), filed.filters, mode, settings)
-    grades: tuple[InsGrade, ...] = (filed.ins,)
+    settings = load_study(config, stated)
+    entries = _entries(words(names), settings.filters, mode, limits)
+    grades: tuple[InsGrade, ...] = (settings.ins,)
     if calibration is not None:
-        filed, grades = _calibrated(filed, calibration)
-    return Navigation(filed.with_digests(), tuple(entries), grades)
+        settings, grades = _calibrated(settings, calibration)
+    return Navigation(settings.with_digests(), tuple(entries), grades)
 
 
 def _entries(
-    names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, settings: dict[str, Any]
+    names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, limits: Mapping[str, Any]
 ) -> list[FilterEntry]:
     """Return the filters by name or label, in the modes that were asked for."""
     from accelcal_cli.navigation.study import FilterEntry, filter_names
@@ -154,7 +157,7 @@ def _entries(
         wanted = list(dict.fromkeys([*stated, *filter_names()]))
     chosen = [stated.get(name) or FilterEntry(name) for name in wanted]
     modes: list[str | None] = ["default", "literal"] if mode == "both" else [mode]
-    return [entry.with_settings({**settings, "mode": each}) for each in modes for entry in chosen]
+    return [entry.with_settings({**limits, "mode": each}) for each in modes for entry in chosen]
 
 
 def _calibrated(settings: NavigationSettings, source: str) -> tuple[NavigationSettings, tuple[InsGrade, ...]]:
@@ -171,58 +174,16 @@ def _calibrated(settings: NavigationSettings, source: str) -> tuple[NavigationSe
     return free, (ins, grade_of(result, ins, source))
 
 
-def show(study: Navigation, records: Sequence[Record], format: str) -> None:
-    """Print the summary in a format; "" prints nothing."""
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+def _show(study: Navigation, records: Sequence[Record], format: str) -> None:
+    """Print the summary in a format."""
     from accelcal_cli.views.navigation import summary
 
     rows = summary(study, records)
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([rows])))
-    elif format == "csv":
-        write_csv(rows, sys.stdout)
-    elif format:
+    if not options.print_rows(format, rows):
         from accelcal_cli.output.console import show
 
         show([rows])
     sys.stdout.flush()
-
-
-def reproduce(
-    name: str,
-    runs: int | None,
-    seed: int | None,
-    raw: str | None,
-    jobs: int,
-    cluster: str | None,
-    resume: bool,
-    plot: str | None,
-    format: str,
-    quiet: bool,
-) -> None:
-    """Run a shipped experiment on navigation filters and print it beside the paper's numbers."""
-    from accelcal_cli.navigation.study import Navigation, load_study
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.views.navigation import summary, with_paper
-
-    settings = load_study(name, {"runs": runs, "seed": seed})
-    study = Navigation(settings, settings.filters, (settings.ins,))
-    records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
-    table = with_paper(summary(study, records), settings)
-    if format == "json":
-        parts = [{"title": table.title, "rows": json_rows([table])}]
-        sys.stdout.write(json_text({"name": name, "title": settings.title, "tables": parts}))
-    elif format == "csv":
-        write_csv(table, sys.stdout)
-    else:
-        from accelcal_cli.output.console import show
-
-        show([table])
-    sys.stdout.flush()
-    _write(study, records, None, plot)
-    if not quiet:
-        for path in filter(None, (raw, plot)):
-            typer.echo(f"accelcal: wrote {path}", err=True)
 
 
 def _write(study: Navigation, records: Sequence[Record], output: str | None, plot: str | None) -> None:
@@ -233,12 +194,12 @@ def _write(study: Navigation, records: Sequence[Record], output: str | None, plo
     from accelcal_cli.output.machine import write_csv
     from accelcal_cli.views.navigation import curves
 
-    found = curves(study, records)
+    table = curves(study, records)
     if output is not None:
         with whole_file(output) as file:
-            write_csv(found, file)
+            write_csv(table, file)
     if plot is not None:
         from accelcal_cli.output.plot import plot_voyage
         from accelcal_cli.views.navigation import chart_of
 
-        plot_voyage(chart_of(study, records, found), plot)
+        plot_voyage(chart_of(study, records, table), plot)

@@ -12,7 +12,13 @@ from accelcal_cli.cli import options
 
 def command(
     name: Annotated[
-        str | None, typer.Argument(help="One optimizer: its settings and what they mean.", show_default="all")
+        str | None,
+        typer.Argument(
+            help="One optimizer: its settings and what they mean.",
+            show_default="all",
+            rich_help_panel="Input",
+            autocompletion=options.one_of(options.optimizers),
+        ),
     ] = None,
     format: options.Format = "table",
     quiet: options.Quiet = False,
@@ -20,19 +26,12 @@ def command(
     """List the optimizers, their settings and their papers."""
     from accelcal_cli.optimization.optimizer import OPTIMIZERS
     from accelcal_cli.output.console import show
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+    from accelcal_cli.output.machine import json_rows
     from accelcal_cli.views.optimizers import catalogue, catalogue_blocks, flat, settings, settings_blocks
 
-    options.check_format(format)
     table = settings(name) if name else catalogue()
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([table])))
-    elif format == "csv":
-        write_csv(flat(table), sys.stdout)
-    elif name:
-        show(settings_blocks(table))
-    else:
-        show(catalogue_blocks(table))
+    if not options.print_data(format, lambda: json_rows([table]), lambda: flat(table)):
+        show(settings_blocks(table) if name else catalogue_blocks(table))
     sys.stdout.flush()
     if not quiet:
         for fault in OPTIMIZERS.faults.values():

@@ -1,68 +1,388 @@
-"""Options that several commands share, and the checks on them.
+"""Options that several commands share, groups of options, and the checks on them.
 
-Options that `detect` and `calibrate --raw` share, and what they come to.
-
-What every command that runs a study shares: its options, and the running itself.
-
-records = running.run(study, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
+A group is a frozen dataclass whose fields are options: a command that has a parameter of such a type takes them all,
+and `expand` spells them out for typer. An option's panel is its heading in the help; what `one_of` or `several_of`
+offers to the shell stands in the help in place of {choices}.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import math
 import os
+import pkgutil
+import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from accelcal_cli.cli import process as signals
-from accelcal_cli.errors import AccelcalError, Interrupted, UsageError, did_you_mean
+from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
-    from accelcal_cli.studies.engine import Executors, Journal
-    from accelcal_cli.studies.engine import Progress as Report
-    from accelcal_cli.studies.study import Record, Study
+    from accelcal_cli.table import Table
 
+Complete = Callable[[str], list[str]]
+"""What the shell asks for values: from what is typed so far to what it may become."""
+
+CHOICES = "{choices}"
+
+
+def one_of(names: Iterable[str] | Callable[[], Iterable[str]]) -> Complete:
+    """Return the completion of an option that takes one of some names; a function is asked when they are needed."""
+
+    def complete(incomplete: str) -> list[str]:  # noqa: ARG001  # typer picks what begins so
+        return list(names() if callable(names) else names)
+
+    return complete
+
+
+def several_of(names: Iterable[str] | Callable[[], Iterable[str]]) -> Complete:
+    """Return the completion of an option that takes some of the names, separated by commas."""
+
+    def complete(incomplete: str) -> list[str]:
+        before, comma, _ = incomplete.rpartition(",")
+        return [f"{before}{comma}{name}" for name in one_of(names)("")]
+
+    return complete
+
+
+def help_text(parameter: Any, ctx: Any, text: str) -> str:
+    """Return the help of a parameter with its choices in place of {choices}.
+
+    Without the parentheses that typer puts round a default that is a text.
+    """
+    text = re.sub(r"default: \((.*)\)(?=[;\]])", r"default: \1", text)
+    if CHOICES not in text:
+        return text
+    names = [item.value for item in parameter.shell_complete(ctx, "")]
+    return text.replace(CHOICES, " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))))
+
+
+def classes_in(package: str, group: str) -> list[str]:
+    """Return the names in a registry without importing a class: help and a shell that completes do not wait for numpy.
+
+    Args:
+        package, group: of the registry, see `registry.Registry`.
+    """
+    modules = (module.name for module in pkgutil.iter_modules(import_module(package).__path__))
+    names = {name.replace("_", "-") for name in modules if name != "base"}
+    if _is_mentioned(group):
+        from importlib.metadata import entry_points
+
+        names.update(point.name for point in entry_points(group=group))
+    return sorted(names)
+
+
+def _is_mentioned(group: str) -> bool:
+    """Return whether an installed package may have entry points of a group: `importlib.metadata` is slow to import."""
+    files = (file for folder in sys.path for file in Path(folder).glob("*-info/entry_points.txt"))
+    return any(f"[{group}]" in file.read_text("utf-8", errors="replace") for file in files)
+
+
+optimizers = partial(classes_in, "accelcal_cli.optimization.algorithms", "accelcal.optimizers")
+filters = partial(classes_in, "accelcal_cli.navigation.filters", "accelcal.filters")
+exporters = partial(classes_in, "accelcal_cli.exporters", "accelcal.exporters")
+
+
+def optimizers_or_all() -> list[str]:
+    """Return the names of the optimizers, and "all"."""
+    return [*optimizers(), "all"]
+
+
+def shipped(kind: str) -> list[str]:
+    """Return the names of the shipped configurations of a kind: sensors, studies."""
+    from accelcal_cli import config
+
+    return list(config.shipped(kind))
+
+
+def panel(heading: str) -> Callable[..., Any]:
+    """Return typer.Option for options that stand under a heading of the help."""
+    return partial(typer.Option, rich_help_panel=heading)
+
+
+def expand(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command as typer wants it: every group of options spelled out as the options themselves.
+
+    A parameter stands for a group when its type is a dataclass, or when its annotation carries a function that returns
+    one (`Annotated[Any, function]`), for options that are known only when they are asked for.
+    """
+    groups: dict[str, Any] = {}
+    spelled: dict[str, inspect.Parameter] = {}
+    hints = get_type_hints(command, include_extras=True)
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        makers = [part for part in get_args(hint)[1:] if inspect.isfunction(part)]
+        group = makers[0]() if makers else hint
+        if not dataclasses.is_dataclass(group):
+            spelled[parameter.name] = parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
+            continue
+        groups[parameter.name] = group
+        own = get_type_hints(group, include_extras=True)
+        for field in dataclasses.fields(group):
+            spelled[field.name] = inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=own[field.name]
+            )
+
+    def run(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{f.name: values.pop(f.name) for f in dataclasses.fields(group)})
+        command(**values)
+
+    run.__doc__ = command.__doc__
+    run.__signature__ = inspect.Signature(list(spelled.values()))  # type: ignore[attr-defined]
+    return run
+
+
+def stated(**values: Any) -> dict[str, Any]:
+    """Return the options that were stated, by name; those of a group as `**vars(group)`."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+# Options of one kind in all commands
 
 FORMATS = ("table", "json", "csv")
+SCHEMES = ("faces", "edges", "faces-edges", "icosahedron", "turns", "fibonacci", "random")
+GAUGES = ("lower", "upper", "symmetric", "full")
+WEIGHTS = ("none", "n", "sd", "auto")
+UNITS = ("m/s^2", "g", "mg")
+FIXTURES = ("faces", "edges", "corners", "any")
+"""Names of the library, stated again so that help need not import it; tests compare them."""
 
-Format = Annotated[str, typer.Option("--format", help="What to print: table, json or csv.", metavar="FORMAT")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers.", min=0)]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing on standard error but errors.")]
-Gravity = Annotated[
-    float | None,
-    typer.Option(
-        "--g", help="Local gravity in m/s^2 (1 for readings in units of g).", show_default="9.80665"
-    ),
-]
-Latitude = Annotated[
-    float | None, typer.Option("--latitude", help="Degrees; gravity from WGS84 instead of --g.")
-]
-Height = Annotated[
-    float | None, typer.Option("--height", help="Metres above the ellipsoid, with --latitude.")
+
+def check_choice(option: str, choice: str, names: Iterable[str]) -> str:
+    """Return a choice that is one of the names or raise UsageError."""
+    if choice not in names:
+        raise UsageError(
+            f'{option} "{choice}": unknown{did_you_mean(choice, names)}; expected one of {", ".join(names)}'
+        )
+    return choice
+
+
+def _check_format(choice: str) -> str:
+    return check_choice("--format", choice, FORMATS)
+
+
+def check_positive(option: str, value: float | None, unit: str = "") -> float | None:
+    """Return the value of an option that was not stated or is a positive number, or raise UsageError."""
+    if value is not None and not (math.isfinite(value) and value > 0):
+        raise UsageError(f"{option} {value:g}: expected a positive number{unit}")
+    return value
+
+
+def check_tolerance(tolerance: float | None) -> float | None:
+    """Return a tolerance that was not stated or is a positive number, or raise UsageError."""
+    return check_positive("--tolerance", tolerance, " in m/s^2")
+
+
+LARGEST_NOISE = 100.0
+"""m/s^2, ten times gravity."""
+
+
+def check_noise(noise: float | None) -> float | None:
+    """Return a noise that was not stated or can be the sigma of an accelerometer in m/s^2, or raise UsageError."""
+    if noise is not None and not 0 <= noise <= LARGEST_NOISE:
+        raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
+    return noise
+
+
+in_input, in_output = panel("Input"), panel("Output")
+
+ResultFile = Annotated[
+    str,
+    typer.Argument(help="Result file of accelcal calibrate; - is standard input.", rich_help_panel="Input"),
 ]
 Columns = Annotated[
     str | None,
-    typer.Option("--columns", help="The three output columns: names, or numbers from 1, with commas."),
+    in_input("--columns", help="The three output columns: names, or numbers from 1, separated by commas."),
 ]
+Force = Annotated[bool, in_input("--force", help="Use a result although its verdict is undetermined.")]
+Format = Annotated[
+    str,
+    in_output(
+        "--format",
+        help="What to print: {choices}.",
+        metavar="FORMAT",
+        autocompletion=one_of(FORMATS),
+        callback=_check_format,
+    ),
+]
+Quiet = Annotated[bool, in_output("--quiet", "-q", help="Print nothing on standard error but errors.")]
 
 
-def check_format(choice: str) -> str:
-    """Return a known output format or raise UsageError."""
-    if choice not in FORMATS:
-        raise UsageError(
-            f'--format "{choice}": unknown{did_you_mean(choice, FORMATS)}; expected one of {", ".join(FORMATS)}'
+@dataclass(frozen=True)
+class GravityOptions:
+    """Local gravity, stated in one of two ways or not at all."""
+
+    g: Annotated[
+        float | None,
+        in_input(
+            "--g", help="Local gravity in m/s^2 (1 for readings in units of g).", show_default="9.80665"
+        ),
+    ] = None
+    latitude: Annotated[float | None, in_input(help="Degrees; gravity from WGS84 instead of --g.")] = None
+    height: Annotated[float | None, in_input(help="Metres above the ellipsoid, with --latitude.")] = None
+
+    def stated(self) -> float | None:
+        """Return the stated local gravity in m/s^2, or None when nothing was stated.
+
+        Raises:
+            UsageError: out of range, stated twice, or a height without a latitude.
+        """
+        from accelcal_cli.sensor.gravity import check_gravity, normal_gravity
+
+        if self.g is not None and self.latitude is not None:
+            raise UsageError("--g and --latitude: expected one of them, not both")
+        if self.height is not None and self.latitude is None:
+            raise UsageError("--height needs --latitude")
+        if self.g is not None:
+            return check_gravity(self.g)
+        return None if self.latitude is None else normal_gravity(self.latitude, self.height or 0.0)
+
+
+LARGEST_MULTIPLIER = 1e6
+LARGEST_RATE = 1e6
+LARGEST_MERGE, LARGEST_THIN = 5.0, 90.0
+"""Degrees: the mean of poses that differ more is shorter than gravity by over a thousandth of it."""
+
+in_log = panel("Raw log")
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """How static poses are found in a raw log, as `detect` and `calibrate --raw` take it."""
+
+    gyro: Annotated[
+        str | None,
+        in_log(help="The three gyroscope columns, or none.", show_default="found by name", metavar="COLUMNS"),
+    ] = None
+    time: Annotated[
+        str | None, in_log(help="The time column, or none.", show_default="found by name", metavar="COLUMN")
+    ] = None
+    rate: Annotated[
+        float | None, in_log(help="Rows per second.", show_default="from the time column", metavar="HZ")
+    ] = None
+    window: Annotated[
+        str | None,
+        in_log(
+            help="Window of the variance: seconds, or rows as in 101rows.",
+            show_default="1 s; 101 rows without time",
+            metavar="SPAN",
+        ),
+    ] = None
+    still: Annotated[
+        str | None,
+        in_log(
+            help="Still period at the beginning that sets the threshold: seconds, or rows.",
+            show_default="the quietest windows set it",
+            metavar="SPAN",
+        ),
+    ] = None
+    multiplier: Annotated[
+        str | None,
+        in_log(
+            help="Threshold as a multiple of the still variance; of several, separated by commas, the best is kept.",
+            show_default="2 to 100",
+            metavar="NUMBERS",
+        ),
+    ] = None
+    min_length: Annotated[
+        str | None,
+        in_log(
+            help="Shortest interval after trimming: seconds, or rows.",
+            show_default="1 s; 100 rows without time",
+            metavar="SPAN",
+        ),
+    ] = None
+    trim: Annotated[
+        str | None,
+        in_log(
+            help="Cut this off both ends of an interval: seconds, or rows.",
+            show_default="half a window",
+            metavar="SPAN",
+        ),
+    ] = None
+    merge: Annotated[float | None, in_log(help="Join poses within this many degrees.", metavar="DEGREES")] = (
+        None
+    )
+    thin: Annotated[
+        float | None,
+        in_log(help="Of poses within this many degrees keep only the longest.", metavar="DEGREES"),
+    ] = None
+    min_poses: Annotated[
+        int | None,
+        in_log(help="Attitudes, 5 degrees apart, that must be found.", show_default="12", min=2),
+    ] = None
+
+    def detect(self, data: str, columns: str | None, g: float, picture: bool = False) -> Detection:
+        """Find the static poses of a raw log.
+
+        Args:
+            data: file, or - for standard input.
+            columns: option --columns.
+            g: local gravity, m/s^2.
+            picture: keep what a picture of the log needs.
+        """
+        from accelcal_cli.detection.detect import detect
+        from accelcal_cli.detection.rawlog import open_raw_log
+
+        check_input(data)
+        settings = self._settings(g)
+        log = open_raw_log(
+            data, split_columns(columns), split_columns(self.gyro), self.time, stdin=sys.stdin.buffer
         )
-    return choice
+        try:
+            return detect(log, settings, picture)
+        finally:
+            log.close()
+
+    def _settings(self, g: float) -> DetectSettings:
+        from accelcal_cli.detection.detect import MULTIPLIERS, DetectSettings
+        from accelcal_cli.detection.windows import Spans, parse_span
+
+        if self.merge is not None and self.thin is not None:
+            raise UsageError("--merge and --thin: expected one of them, not both")
+        names = ("window", "still", "min_length", "trim")
+        spans = [parse_span(getattr(self, name), f"--{name.replace('_', '-')}") for name in names]
+        return DetectSettings(
+            spans=Spans(*spans),
+            rate=_between("--rate", self.rate, LARGEST_RATE, "rows per second"),
+            multipliers=MULTIPLIERS if self.multiplier is None else _multipliers(self.multiplier),
+            merge=_between("--merge", self.merge, LARGEST_MERGE, "degrees"),
+            thin=_between("--thin", self.thin, LARGEST_THIN, "degrees"),
+            least_poses=DetectSettings.least_poses if self.min_poses is None else self.min_poses,
+            g=g,
+        )
+
+
+def _between(option: str, value: float | None, most: float, unit: str) -> float | None:
+    if value is not None and not 0 < value <= most:
+        raise UsageError(f"{option} {value:g}: expected more than 0 and at most {most:g} {unit}")
+    return value
+
+
+def _multipliers(text: str) -> tuple[float, ...]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = [math.nan]
+    if not all(1 < value <= LARGEST_MULTIPLIER for value in values):
+        raise UsageError(
+            f'--multiplier "{text}": expected numbers above 1, at most {LARGEST_MULTIPLIER:g}, separated by commas'
+        )
+    return tuple(sorted(set(values)))
+
+
+# What commands check, read and tell
 
 
 def check_input(source: str) -> None:
@@ -72,7 +392,7 @@ def check_input(source: str) -> None:
 
 
 def check_apart(inputs: Iterable[str | Path | None], outputs: Mapping[str, str | None]) -> None:
-    """Raise UsageError when an output would take the place of a file that is read.
+    """Raise UsageError when an output would replace a file that is read.
 
     Args:
         inputs: files that are read, - for standard input, None for one that was not stated.
@@ -95,6 +415,17 @@ def _identity(source: str | Path) -> os.stat_result | None:
         return None
 
 
+def check_suffix(option: str, path: str, suffixes: tuple[str, ...]) -> None:
+    """Raise UsageError when the name of a file to write does not end as it should."""
+    if Path(path).suffix not in suffixes:
+        raise UsageError(f'{option} "{path}": expected a name that ends in {" or ".join(suffixes)}')
+
+
+def split_columns(text: str | None) -> list[str] | None:
+    """Return the columns named with commas, or None when none were named."""
+    return None if text is None else [part.strip() for part in text.split(",")]
+
+
 def load_result(source: str, data: str | None = None) -> Calibration:
     """Return the calibration of a result file, or of standard input for `-`.
 
@@ -114,314 +445,52 @@ def load_result(source: str, data: str | None = None) -> Calibration:
     return result.load_result("<stdin>", sys.stdin.buffer)
 
 
-def gravity(g: float | None, latitude: float | None, height: float | None) -> float | None:
-    """Return the stated local gravity in m/s^2, or None when nothing was stated.
+def print_data(format: str, record: Callable[[], object], table: Callable[[], Table]) -> bool:
+    """Print what other programs read; return whether that was asked for, or else a table for people.
 
-    Raises:
-        UsageError: out of range, stated twice, or a height without a latitude.
+    Args:
+        format: of FORMATS.
+        record: makes what json prints.
+        table: makes what csv prints.
     """
-    from accelcal_cli.sensor.gravity import check_gravity, normal_gravity
+    from accelcal_cli.output.machine import json_text, write_csv
 
-    if g is not None and latitude is not None:
-        raise UsageError("--g and --latitude: expected one of them, not both")
-    if height is not None and latitude is None:
-        raise UsageError("--height: needs --latitude")
-    if g is not None:
-        return check_gravity(g)
-    return None if latitude is None else normal_gravity(latitude, height or 0.0)
+    if format == "json":
+        sys.stdout.write(json_text(record()))
+    elif format == "csv":
+        write_csv(table(), sys.stdout)
+    return format != "table"
+
+
+def print_rows(format: str, table: Table) -> bool:
+    """Print a table for other programs; return whether that was asked for."""
+    from accelcal_cli.output.machine import json_rows
+
+    return print_data(format, lambda: json_rows([table]), lambda: table)
+
+
+def tell(notes: Iterable[str], quiet: bool = False) -> None:
+    """Say something on standard error, a line each, unless quiet."""
+    for note in () if quiet else notes:
+        typer.echo(f"accelcal: {note}", err=True)
+
+
+def tell_written(paths: Iterable[str | None], quiet: bool) -> None:
+    """Name the files that were written on standard error, unless quiet."""
+    tell((f"wrote {path}" for path in paths if path not in (None, "-")), quiet)
 
 
 def caution(source: str, cautions: Iterable[str], quiet: bool) -> None:
     """Say on standard error, unless quiet, what speaks against trusting a file."""
-    for text in () if quiet else cautions:
-        typer.echo(f"accelcal: {source}: caution: {text}", err=True)
+    tell((f"{source}: caution: {text}" for text in cautions), quiet)
 
 
-def check_tolerance(tolerance: float | None) -> None:
-    """Raise UsageError when a stated tolerance is not a positive number."""
-    if tolerance is not None and not (math.isfinite(tolerance) and tolerance > 0):
-        raise UsageError(f"--tolerance {tolerance:g}: expected a positive number in m/s^2")
-
-
-def split_columns(text: str | None) -> list[str] | None:
-    """Return the columns named with commas, or None when none were named."""
-    return None if text is None else [part.strip() for part in text.split(",")]
-
-
-def check_positive(option: str, value: float) -> None:
-    """Raise UsageError when the value of an option is not a positive number."""
-    if not (math.isfinite(value) and value > 0):
-        raise UsageError(f"{option} {value:g}: expected a positive number")
-
-
-LARGEST_MULTIPLIER = 1e6
-LARGEST_RATE = 1e6
-LARGEST_MERGE, LARGEST_THIN = 5.0, 90.0
-"""Degrees: the mean of poses that differ more is shorter than gravity by over a thousandth of it."""
-
-Gyro = Annotated[
-    str | None,
-    typer.Option(
-        help="The three gyroscope columns, or none.", show_default="found by name", metavar="COLUMNS"
-    ),
-]
-Time = Annotated[
-    str | None,
-    typer.Option(help="The time column, or none.", show_default="found by name", metavar="COLUMN"),
-]
-Rate = Annotated[
-    float | None, typer.Option(help="Rows a second.", show_default="from the time column", metavar="HZ")
-]
-Window = Annotated[
-    str | None,
-    typer.Option(
-        help="Window of the variance: seconds, or rows as in 101rows.",
-        show_default="1 s; 101 rows without time",
-        metavar="SPAN",
-    ),
-]
-Still = Annotated[
-    str | None,
-    typer.Option(
-        help="Still period at the beginning that sets the threshold: seconds, or rows.",
-        show_default="the quietest windows set it",
-        metavar="SPAN",
-    ),
-]
-Multiplier = Annotated[
-    str | None,
-    typer.Option(
-        help="Threshold as a multiple of the still variance; of several, with commas, the best is kept.",
-        show_default="2 to 100",
-        metavar="NUMBERS",
-    ),
-]
-MinLength = Annotated[
-    str | None,
-    typer.Option(
-        help="Least length of an interval after trimming: seconds, or rows.",
-        show_default="1 s; 100 rows without time",
-        metavar="SPAN",
-    ),
-]
-Trim = Annotated[
-    str | None,
-    typer.Option(
-        help="Cut off both ends of an interval: seconds, or rows.",
-        show_default="half a window",
-        metavar="SPAN",
-    ),
-]
-Merge = Annotated[float | None, typer.Option(help="Join poses within this many degrees.", metavar="DEGREES")]
-Thin = Annotated[
-    float | None,
-    typer.Option(help="Of poses within this many degrees keep only the longest.", metavar="DEGREES"),
-]
-MinPoses = Annotated[
-    int | None,
-    typer.Option(help="Attitudes, 5 degrees apart, that must be found.", show_default="12", min=2),
-]
-
-
-def stated(**values: Any) -> dict[str, Any]:
-    """Return the options that were stated."""
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def find_poses(
-    data: str, columns: str | None, chosen: Mapping[str, Any], g: float, picture: bool = False
-) -> Detection:
-    """Find the static poses of a raw log as the stated options say.
-
-    Args:
-        data: file, or - for standard input.
-        columns: option --columns.
-        chosen: the other options of this module that were stated, by name.
-        g: local gravity, m/s^2.
-        picture: keep what a picture of the log needs.
-    """
-    from accelcal_cli.detection.detect import detect
-    from accelcal_cli.detection.rawlog import open_raw_log
-
-    check_input(data)
-    settings = _settings(chosen, g)
-    log = open_raw_log(
-        data, _split(columns), _split(chosen.get("gyro")), chosen.get("time"), stdin=sys.stdin.buffer
+def tell_assumed_gravity(g: float, quiet: bool, further: str = "") -> None:
+    """Say on standard error that standard gravity was assumed."""
+    tell(
+        [
+            f"g = {g} assumed; state yours with --g or --latitude and --height (scale factors are proportional to it)"
+            f"{further}"
+        ],
+        quiet,
     )
-    try:
-        return detect(log, settings, picture)
-    finally:
-        log.close()
-
-
-def _settings(chosen: Mapping[str, Any], g: float) -> DetectSettings:
-    from accelcal_cli.detection.detect import MULTIPLIERS, DetectSettings
-    from accelcal_cli.detection.windows import Spans, parse_span
-
-    if "merge" in chosen and "thin" in chosen:
-        raise UsageError("--merge and --thin: expected one of them, not both")
-    names = ("window", "still", "min_length", "trim")
-    spans = [parse_span(chosen.get(name), f"--{name.replace('_', '-')}") for name in names]
-    multipliers = chosen.get("multiplier")
-    return DetectSettings(
-        spans=Spans(*spans),
-        rate=_between("--rate", chosen.get("rate"), LARGEST_RATE, "rows a second"),
-        multipliers=MULTIPLIERS if multipliers is None else _multipliers(multipliers),
-        merge=_between("--merge", chosen.get("merge"), LARGEST_MERGE, "degrees"),
-        thin=_between("--thin", chosen.get("thin"), LARGEST_THIN, "degrees"),
-        least_poses=chosen.get("min_poses", DetectSettings.least_poses),
-        g=g,
-    )
-
-
-def _split(text: str | None) -> Sequence[str] | None:
-    return None if text is None else [part.strip() for part in text.split(",")]
-
-
-def _between(option: str, value: float | None, most: float, unit: str) -> float | None:
-    if value is not None and not 0 < value <= most:
-        raise UsageError(f"{option} {value:g}: expected more than 0 and at most {most:g} {unit}")
-    return value
-
-
-def _multipliers(text: str) -> tuple[float, ...]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = [math.nan]
-    if not all(1 < value <= LARGEST_MULTIPLIER for value in values):
-        raise UsageError(
-            f'--multiplier "{text}": expected numbers above 1, at most {LARGEST_MULTIPLIER:g}, with commas'
-        )
-    return tuple(sorted(set(values)))
-
-
-MOST_JOBS = 1024
-RAW_SUFFIXES = (".csv", ".parquet")
-PLOT_SUFFIXES = (".png", ".svg")
-
-Jobs = Annotated[
-    int, typer.Option("--jobs", "-j", help="Processes on this machine.", min=1, max=MOST_JOBS, metavar="N")
-]
-Cluster = Annotated[
-    str | None,
-    typer.Option("--cluster", help="Run on a Dask cluster: tcp://host:8786.", metavar="ADDRESS"),
-]
-Raw = Annotated[
-    str | None,
-    typer.Option("--raw", help="File for every run's result: .csv or .parquet.", metavar="FILE"),
-]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with an interrupted study; its runs are in FILE.journal.")
-]
-Plot = Annotated[
-    str | None, typer.Option("--plot", help="Draw convergence to a .png or .svg file.", metavar="FILE")
-]
-
-
-def check_plot(plot: str | None) -> None:
-    """Refuse a plot that could not be written, before any run is made for it.
-
-    Raises:
-        UsageError: another suffix, or matplotlib is missing.
-        OutputError: the file cannot be written.
-    """
-    if plot is None:
-        return
-    from importlib.util import find_spec
-
-    _check_target("--plot", plot, PLOT_SUFFIXES)
-    if find_spec("matplotlib") is None:
-        raise UsageError("--plot needs matplotlib: pip install 'accelcal[plot]'")
-
-
-def run(
-    study: Study, *, raw: str | None, jobs: int, cluster: str | None, resume: bool, quiet: bool
-) -> list[Record]:
-    """Run a study as the options say, write the raw file, and return all records by cell and run.
-
-    With a raw file the finished runs are kept in a journal beside it until it is written.
-
-    Args:
-        study: what to run.
-        raw, jobs, cluster, resume, quiet: the shared options of the command.
-
-    Raises:
-        UsageError: options that do not go together, or a raw file with another suffix.
-        AccelcalError: what the study, the journal or the cluster could not do.
-    """
-    _check(raw, jobs, cluster, resume)
-    from accelcal_cli.output.machine import write_table
-    from accelcal_cli.studies.engine import Journal, run_study
-    from accelcal_cli.views.studies import raw_table
-
-    journal = Journal.open(Path(f"{raw}.journal") if raw else None, study, resume)
-    try:
-        with _progress(quiet) as progress:
-            records = run_study(study, journal, _executors(study, jobs, cluster), progress)
-        if raw is not None:
-            write_table(raw_table(study, records), raw)
-    except KeyboardInterrupt as stop:
-        ending = signals.interrupted(stop)
-        raise Interrupted(f"{ending}{_kept(journal)}", ending.code) from None
-    except AccelcalError as error:
-        raise type(error)(f"{error}{_kept(journal)}") from None
-    journal.remove()
-    return records
-
-
-def _kept(journal: Journal) -> str:
-    """Return what to say of finished runs after a failure; a journal without any goes."""
-    if not journal.done:
-        journal.remove()
-    if journal.path is None or not journal.done:
-        return ""
-    runs = sum(map(len, journal.done.values()))
-    return f"; {runs:,} finished runs are kept in {journal.path}, --resume goes on with them"
-
-
-def _check(raw: str | None, jobs: int, cluster: str | None, resume: bool) -> None:
-    if raw is not None:
-        _check_target("--raw", raw, RAW_SUFFIXES)
-    elif resume:
-        raise UsageError("--resume: needs the --raw FILE of the interrupted study")
-    if cluster is not None and jobs != 1:
-        raise UsageError("--jobs and --cluster: expected one of them, not both")
-
-
-def _check_target(option: str, path: str, suffixes: tuple[str, ...]) -> None:
-    from accelcal_cli.output.files import check_target
-
-    if Path(path).suffix not in suffixes:
-        raise UsageError(f'{option} "{path}": expected a name that ends in {" or ".join(suffixes)}')
-    check_target(path)
-
-
-def _executors(study: Study, jobs: int, address: str | None) -> Executors | None:
-    from accelcal_cli.studies import pools
-
-    if address is not None:
-        return partial(pools.cluster, address)
-    useful = min(jobs, len(study.tasks()))
-    return partial(pools.local_pool, useful) if useful > 1 else None
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Report | None]:
-    """Open a bar with the time left on standard error, when somebody looks at it."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("runs", total=None)
-
-        def update(done: int, total: int) -> None:
-            if bar.tasks[0].total is None:
-                bar.reset(task, total=total, completed=done)
-            bar.update(task, completed=done)
-
-        yield update

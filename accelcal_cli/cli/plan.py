@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import io
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import process as pipes
-from accelcal_cli.errors import UsageError, did_you_mean
+from accelcal_cli.cli import options, process
+from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
@@ -24,18 +22,24 @@ BAD_VERDICT = 1
 RESULTS = (".yaml", ".yml", ".json")
 """Endings of a result file; anything else holds readings."""
 
+in_plan = options.panel("Plan")
+
 
 def command(
+    *,
     data: Annotated[
         str | None,
         typer.Argument(
             help="The poses so far: readings, or a result file (.yaml, .json); - is standard input.",
             show_default="none",
+            rich_help_panel="Input",
         ),
     ] = None,
+    columns: options.Columns = None,
+    gravity: options.GravityOptions,
     poses: Annotated[
         int | None,
-        typer.Option(
+        in_plan(
             help="Poses in the end, those so far included.",
             show_default="12 from nothing",
             min=1,
@@ -44,21 +48,21 @@ def command(
     ] = None,
     add: Annotated[
         int | None,
-        typer.Option(
+        in_plan(
             help="Poses to add, instead of --poses.", show_default="6 to readings", min=1, max=MOST_POSES
         ),
     ] = None,
     fixture: Annotated[
-        str, typer.Option(help="What the sensor can be held against: faces, edges, corners or any.")
+        str,
+        in_plan(
+            help="What the sensor can be held against: {choices}.",
+            autocompletion=options.one_of(options.FIXTURES),
+        ),
     ] = "corners",
     noise: Annotated[
         float | None,
-        typer.Option(help="Noise of one pose, one sigma, m/s^2.", show_default="s of the poses so far"),
+        in_plan(help="Noise of one pose, one sigma, m/s^2.", show_default="s of the poses so far"),
     ] = None,
-    columns: options.Columns = None,
-    g: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
     format: options.Format = "table",
     quiet: options.Quiet = False,
 ) -> None:
@@ -67,26 +71,19 @@ def command(
     Prints them in words and as vectors, and the sigma to expect after each. Exit code 1 means that not even all
     these poses determine the parameters.
     """
-    from accelcal_cli.planning.design import FIXTURES
-
-    options.check_format(format)
-    if fixture not in FIXTURES:
-        raise UsageError(
-            f'--fixture "{fixture}": unknown{did_you_mean(fixture, FIXTURES)}; expected one of {", ".join(FIXTURES)}'
-        )
-    if noise is not None and not (math.isfinite(noise) and noise > 0):
-        raise UsageError(f"--noise {noise:g}: expected a positive number in m/s^2")
+    options.check_choice("--fixture", fixture, options.FIXTURES)
+    options.check_positive("--noise", noise, " in m/s^2")
     if poses is not None and add is not None:
         raise UsageError("--poses and --add: expected one of them, not both")
-    stated_g = options.gravity(g, latitude, height)
+    stated_g = gravity.stated()
     so_far = _so_far(data, columns, stated_g) if data is not None else None
-    found = _plan(so_far, poses, add, fixture, noise, stated_g)
-    with pipes.even_if_unread():
-        _show(found, format)
-    with pipes.even_if_unread(sys.stderr):
+    proposal = _plan(so_far, poses, add, fixture, noise, stated_g)
+    with process.even_if_unread():
+        _show(proposal, format)
+    with process.even_if_unread(sys.stderr):
         if so_far is not None and format != "table":  # the table shows them itself
             options.caution(str(data), so_far.cautions, quiet)
-    if found.verdict == "undetermined":
+    if proposal.verdict == "undetermined":
         raise typer.Exit(BAD_VERDICT)
 
 
@@ -131,10 +128,10 @@ def _plan(
     from accelcal_cli.planning.plan import plan
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
-    taken = 0 if so_far is None else so_far.poses
-    count = add or ((poses or FROM_NOTHING) - taken if poses or so_far is None else NEXT)
+    existing = 0 if so_far is None else so_far.poses
+    count = add or ((poses or FROM_NOTHING) - existing if poses or so_far is None else NEXT)
     if count < 1:
-        raise UsageError(f"--poses {poses}: {taken} poses are there already; expected more, or --add")
+        raise UsageError(f"--poses {poses}: {existing} poses exist already; expected more, or --add")
     if count > MOST_POSES:
         raise UsageError(f"--poses {poses}: {count} poses to plan; expected at most {MOST_POSES}")
     local_g = g or STANDARD_GRAVITY
@@ -143,18 +140,13 @@ def _plan(
     known = so_far.s if so_far.freedom > 0 and so_far.s > 0 else None
     sigma = noise or known
     part = None if sigma is None else sigma / so_far.g
-    return plan(so_far.information, taken, count, fixture, part, so_far)
+    return plan(so_far.information, existing, count, fixture, part, so_far)
 
 
-def _show(found: Plan, format: str) -> None:
-    from accelcal_cli.output.machine import json_text, write_csv
+def _show(proposal: Plan, format: str) -> None:
     from accelcal_cli.views.plan import blocks, pose_table, record
 
-    if format == "json":
-        sys.stdout.write(json_text(record(found)))
-    elif format == "csv":
-        write_csv(pose_table(found), sys.stdout)
-    else:
+    if not options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
         from accelcal_cli.output.console import show
 
-        show(blocks(found))
+        show(blocks(proposal))

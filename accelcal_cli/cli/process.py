@@ -1,6 +1,6 @@
-"""Readers of our output that leave early, as `head` does.
+"""What happens to the process: readers of our output that leave early, as `head` does, and signals.
 
-HUP and TERM taken as Ctrl-C is: what a command had begun to write goes, and what it keeps is kept.
+HUP and TERM are taken as Ctrl-C is: what a command had begun to write is removed, and what it keeps is kept.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ def even_if_unread(stream: IO[Any] | None = None) -> Iterator[None]:
 
 
 def drop(stream: IO[Any]) -> None:
-    """Lead what is still buffered for a stream nowhere, or Python would complain of it at its exit."""
+    """Discard what is still buffered for a stream, or Python would complain of it at exit."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
 
 
-NAMES = ("SIGHUP", "SIGTERM")
+SIGNALS = ("SIGHUP", "SIGTERM")
 """A terminal that was closed or a line that was dropped; a polite kill. Windows has no SIGHUP."""
 
 
@@ -45,7 +45,7 @@ class Ended(KeyboardInterrupt):
     """A signal came; `number` is its number."""
 
     def __init__(self, number: int) -> None:
-        """Tell which."""
+        """Keep the number."""
         super().__init__()
         self.number = number
 
@@ -53,7 +53,7 @@ class Ended(KeyboardInterrupt):
 @contextmanager
 def raised() -> Iterator[None]:
     """Raise Ended where HUP or TERM comes; one that is ignored, as nohup has it, stays ignored."""
-    numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+    numbers = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
     before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
 
     def end(number: int, _: FrameType | None) -> None:

@@ -4,38 +4,40 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options
-from accelcal_cli.cli import options as running
+from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.reproduce import Experiment
-    from accelcal_cli.studies.study import Record
     from accelcal_cli.table import Table
 
 
 def command(
+    *,
     name: Annotated[
-        str | None, typer.Argument(help="The experiment; without a name they are listed.")
+        str | None,
+        typer.Argument(
+            help="The experiment; without a name they are listed.",
+            rich_help_panel="Input",
+            autocompletion=options.one_of(partial(options.shipped, "studies")),
+        ),
     ] = None,
     runs: Annotated[
         int | None,
-        typer.Option(help="Runs of each optimizer.", show_default="the paper's", min=1, max=1_000_000),
+        running.in_runs(help="Runs per optimizer.", show_default="the paper's", min=1, max=1_000_000),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of all random numbers.", show_default="the study's", min=0)
+        int | None,
+        running.in_runs(help="Seed of all random numbers.", show_default="the study's", min=0),
     ] = None,
-    raw: running.Raw = None,
-    jobs: running.Jobs = 1,
-    cluster: running.Cluster = None,
-    resume: running.Resume = False,
     plot: running.Plot = None,
     format: options.Format = "table",
-    quiet: options.Quiet = False,
+    study_options: running.StudyOptions,
 ) -> None:
     """Repeat an experiment of the papers, beside their numbers.
 
@@ -44,62 +46,88 @@ def command(
     """
     from accelcal_cli.studies import reproduce
 
-    options.check_format(format)
     if name is None:
         from accelcal_cli.views.experiments import catalogue_table
 
-        _list(catalogue_table(), format, [raw, plot, cluster, runs, seed])
+        _list(catalogue_table(), format, [study_options.raw, plot, study_options.cluster, runs, seed])
         return
     running.check_plot(plot)
     if name in reproduce.navigation_names():
-        from accelcal_cli.cli import navigate
+        _voyage(name, runs, seed, study_options, plot, format)
+    else:
+        _experiment(reproduce.load(name).changed(runs, seed), study_options, plot, format)
+    options.tell_written([study_options.raw, plot], study_options.quiet)
 
-        navigate.reproduce(name, runs, seed, raw, jobs, cluster, resume, plot, format, quiet)
-        return
-    experiment = reproduce.load(name).changed(runs, seed)
-    records = running.run(experiment, raw=raw, jobs=jobs, cluster=cluster, resume=resume, quiet=quiet)
-    _show(experiment, records, format)
+
+def _experiment(
+    experiment: Experiment, study_options: running.StudyOptions, plot: str | None, format: str
+) -> None:
+    """Run an experiment on optimizers and print it beside the paper's numbers."""
+    from accelcal_cli.output.console import show
+    from accelcal_cli.studies.reproduce import curves
+    from accelcal_cli.views.experiments import experiment_tables
+    from accelcal_cli.views.studies import study_blocks
+
+    records = study_options.run(experiment)
+    results = experiment_tables(experiment, records)
+    if format == "table":
+        plotted = curves(experiment, records, shown=True)
+        show(study_blocks(experiment.title, results, plotted, experiment.note))
+    else:
+        _print(experiment.name, experiment.title, results, format)
+    sys.stdout.flush()
     if plot is not None:
         from accelcal_cli.output.plot import plot_convergence
 
-        plot_convergence(experiment.title, reproduce.curves(experiment, records), experiment.tolerance, plot)
-    if not quiet:
-        for path in filter(None, (raw, plot)):
-            typer.echo(f"accelcal: wrote {path}", err=True)
+        plot_convergence(experiment.title, curves(experiment, records), experiment.tolerance, plot)
+
+
+def _voyage(
+    name: str,
+    runs: int | None,
+    seed: int | None,
+    study_options: running.StudyOptions,
+    plot: str | None,
+    format: str,
+) -> None:
+    """Run an experiment on navigation filters and print it beside the paper's numbers."""
+    from accelcal_cli.navigation.study import Navigation, load_study
+    from accelcal_cli.output.console import show
+    from accelcal_cli.views.navigation import chart_of, curves, summary, with_paper
+
+    settings = load_study(name, {"runs": runs, "seed": seed})
+    study = Navigation(settings, settings.filters, (settings.ins,))
+    records = study_options.run(study)
+    table = with_paper(summary(study, records), settings)
+    if format == "table":
+        show([table])
+    else:
+        _print(name, settings.title, [table], format)
+    sys.stdout.flush()
+    if plot is not None:
+        from accelcal_cli.output.plot import plot_voyage
+
+        plot_voyage(chart_of(study, records, curves(study, records)), plot)
+
+
+def _print(name: str, title: str, tables: Sequence[Table], format: str) -> None:
+    """Print the tables of an experiment for other programs."""
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
+
+    if format == "json":
+        parts = [{"title": table.title, "rows": json_rows([table])} for table in tables]
+        sys.stdout.write(json_text({"name": name, "title": title, "tables": parts}))
+        return
+    for number, table in enumerate(tables):
+        sys.stdout.write("\n" if number else "")
+        write_csv(table, sys.stdout)
 
 
 def _list(table: Table, format: str, stated: Sequence[object]) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-
     if any(value is not None for value in stated):
         raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
-    if format == "json":
-        sys.stdout.write(json_text(json_rows([table])))
-    elif format == "csv":
-        write_csv(table, sys.stdout)
-    else:
+    if not options.print_rows(format, table):
         from accelcal_cli.output.console import show
 
         show([table])
-    sys.stdout.flush()
-
-
-def _show(experiment: Experiment, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-    from accelcal_cli.studies.reproduce import curves
-    from accelcal_cli.views.experiments import experiment_tables
-
-    shown = experiment_tables(experiment, records)
-    if format == "json":
-        parts = [{"title": table.title, "rows": json_rows([table])} for table in shown]
-        sys.stdout.write(json_text({"name": experiment.name, "title": experiment.title, "tables": parts}))
-    elif format == "csv":
-        for number, table in enumerate(shown):
-            sys.stdout.write("\n" if number else "")
-            write_csv(table, sys.stdout)
-    else:
-        from accelcal_cli.output.console import show
-        from accelcal_cli.views.studies import study_blocks
-
-        show(study_blocks(experiment.title, shown, curves(experiment, records, shown=True), experiment.note))
     sys.stdout.flush()

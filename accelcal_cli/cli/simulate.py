@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated
-
-import typer
 
 from accelcal_cli.cli import options
 from accelcal_cli.errors import UsageError
@@ -16,54 +15,65 @@ if TYPE_CHECKING:
 
     from accelcal_cli.arrays import Float
     from accelcal_cli.sensor.model import ErrorModel
-    from accelcal_cli.sensor.simulation import Sensor, Simulated
+    from accelcal_cli.sensor.simulation import Sensor, SimulatedReadings
 
 MOST_SAMPLES = 100_000_000
-LARGEST_NOISE = 100.0
-"""m/s^2, ten times gravity."""
+
+in_sensor, in_poses = options.panel("Sensor"), options.panel("Poses")
 
 
 def command(
-    positions: Annotated[int, typer.Option(help="Number of poses.", min=1, max=MOST_SAMPLES)] = 12,
-    scheme: Annotated[
-        str | None,
-        typer.Option(help="faces, edges, faces-edges, icosahedron, turns, fibonacci or random."),
+    *,
+    sensor: Annotated[
+        str,
+        in_sensor(
+            help="Type of the sensor: {choices}, or a YAML file.",
+            autocompletion=options.one_of(partial(options.shipped, "sensors")),
+        ),
+    ] = "dpso",
+    sensors: Annotated[
+        int | None, in_sensor(help="Sensors of this type, drawn with its spread, for `fleet`.", min=1)
     ] = None,
-    sensor: Annotated[str, typer.Option(help="dpso, mems, navigation, or a YAML file.")] = "dpso",
     noise: Annotated[
         float | None,
-        typer.Option(help="Noise of one sample and axis, one sigma, m/s^2.", show_default="the sensor's"),
+        in_sensor(
+            help="Noise of one sample and axis, one sigma, m/s^2.",
+            show_default="the sensor's",
+            callback=options.check_noise,
+        ),
     ] = None,
-    samples: Annotated[int, typer.Option(help="Samples of each pose.", min=1)] = 1,
-    sensors: Annotated[
-        int | None, typer.Option(help="Sensors of this type, drawn with its spread, for `fleet`.", min=1)
+    seed: Annotated[int, in_sensor(help="Seed of all random numbers.", min=0)] = 0,
+    positions: Annotated[int, in_poses(help="Number of poses.", min=1, max=MOST_SAMPLES)] = 12,
+    scheme: Annotated[
+        str | None,
+        in_poses(help="Where the poses point: {choices}.", autocompletion=options.one_of(options.SCHEMES)),
     ] = None,
-    attitude: Annotated[bool, typer.Option(help="Add the true specific force of each row.")] = False,
+    samples: Annotated[int, in_poses(help="Samples per pose.", min=1)] = 1,
+    attitude: Annotated[bool, in_poses(help="Add the true specific force of each row.")] = False,
+    gravity: options.GravityOptions,
     raw: Annotated[
-        bool, typer.Option("--raw", help="Simulate a raw log: poses held, moves between.")
+        bool, options.in_log("--raw", help="Simulate a raw log: poses held, moves between.")
     ] = False,
-    rate: Annotated[float | None, typer.Option(help="With --raw: rows a second.", show_default="100")] = None,
+    rate: Annotated[
+        float | None, options.in_log(help="With --raw: rows per second.", show_default="100")
+    ] = None,
     hold: Annotated[
-        float | None, typer.Option(help="With --raw: seconds of each pose.", show_default="5")
+        float | None, options.in_log(help="With --raw: seconds per pose.", show_default="5")
     ] = None,
     move: Annotated[
-        float | None, typer.Option(help="With --raw: seconds of each move.", show_default="2")
+        float | None, options.in_log(help="With --raw: seconds per move.", show_default="2")
     ] = None,
     tremor: Annotated[
-        float | None, typer.Option(help="With --raw: trembling of the hand, m/s^2 rms.", show_default="0")
+        float | None, options.in_log(help="With --raw: tremor of the hand, m/s^2 rms.", show_default="0")
     ] = None,
-    gyro: Annotated[bool, typer.Option("--gyro", help="With --raw: add a gyroscope, rad/s.")] = False,
-    g: options.Gravity = None,
-    latitude: options.Latitude = None,
-    height: options.Height = None,
-    seed: options.Seed = 0,
-    output: Annotated[str, typer.Option("--output", "-o", help="CSV file; - is standard output.")] = "-",
-    truth: Annotated[str | None, typer.Option(help="YAML file for the true parameters.")] = None,
+    gyro: Annotated[bool, options.in_log("--gyro", help="With --raw: add a gyroscope, rad/s.")] = False,
+    output: Annotated[str, options.in_output("--output", "-o", help="CSV file; - is standard output.")] = "-",
+    truth: Annotated[str | None, options.in_output(help="YAML file for the true parameters.")] = None,
     quiet: options.Quiet = False,
 ) -> None:
     """Simulate static readings of a sensor with known errors.
 
-    With several samples a pose the rows carry the label of their pose, and `calibrate` averages them. With
+    With several samples per pose the rows carry the label of their pose, and `calibrate` averages them. With
     --sensors they carry the label of their sensor, and `fleet` calibrates each. With --raw they are a log of time,
     acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
@@ -74,12 +84,10 @@ def command(
     from accelcal_cli.schema import from_mapping
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.sensor.poses import directions
-    from accelcal_cli.sensor.simulation import Handling, handled, load_sensor, simulate, simulate_fleet
+    from accelcal_cli.sensor.simulation import Handling, load_sensor, simulate, simulate_fleet, simulate_log
 
-    if noise is not None and not 0 <= noise <= LARGEST_NOISE:
-        raise UsageError(f"--noise {noise:g}: expected 0 to {LARGEST_NOISE:g} m/s^2")
     if raw and sensors is not None:
-        raise UsageError("--sensors: does not go with --raw")
+        raise UsageError("--sensors cannot be used with --raw")
     if positions * samples * (sensors or 1) > MOST_SAMPLES:
         many = "" if sensors is None else f" and --sensors {sensors}"
         raise UsageError(
@@ -87,22 +95,23 @@ def command(
         )
     if output == truth:
         raise UsageError(f'--truth "{truth}": expected another file than --output')
-    stated = {"rate": rate, "hold": hold, "move": move, "tremor": tremor}
-    handling = {k: v for k, v in stated.items() if v is not None}
-    _check_raw(raw, [*handling, *(["gyro"] * gyro)], samples, attitude)
+    stated = options.stated(rate=rate, hold=hold, move=move, tremor=tremor)
+    _check_raw(raw, [*stated, *(["gyro"] * gyro)], samples, attitude)
     shipped = not Path(sensor).suffix
     options.check_apart([None if shipped else sensor], {"-o": output, "--truth": truth})
     for path in (output, truth):
         if path is not None:
             check_target(path)
-    local_g = options.gravity(g, latitude, height) or STANDARD_GRAVITY
+    local_g = gravity.stated() or STANDARD_GRAVITY
     device = load_sensor(sensor)
     u = directions(positions, scheme, Streams(seed, [0], Purpose.ATTITUDE).normal(positions, 3)[0])
     sigma = device.noise if noise is None else noise
     record = _truth(device, local_g, sigma, u)
     with whole_file(output) as file:
         if raw:
-            log = handled(device, u, local_g, from_mapping(Handling, handling, "simulate --raw"), sigma, seed)
+            log = simulate_log(
+                device, u, local_g, from_mapping(Handling, stated, "simulate --raw"), sigma, seed
+            )
             record["holds"] = [list(rows) for rows in write_log(log, gyro, file)]
         elif sensors is not None:
             drawn = simulate_fleet(device, sensors, u, local_g, samples, sigma, seed)
@@ -114,17 +123,14 @@ def command(
     if truth is not None:
         with whole_file(truth) as file:
             file.write(dump(record))
-    if not quiet:
-        for path in (output, truth):
-            if path not in (None, "-"):
-                typer.echo(f"accelcal: wrote {path}", err=True)
+    options.tell_written([output, truth], quiet)
 
 
 def _check_raw(raw: bool, stated: list[str], samples: int, attitude: bool) -> None:
     if not raw and stated:
-        raise UsageError(f"--{stated[0]}: goes with --raw only")
+        raise UsageError(f"--{stated[0]} needs --raw")
     if raw and (samples > 1 or attitude):
-        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'}: does not go with --raw")
+        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'} cannot be used with --raw")
 
 
 def _header(file: IO[str], first: list[str], labelled: bool, attitude: bool) -> None:
@@ -133,7 +139,11 @@ def _header(file: IO[str], first: list[str], labelled: bool, attitude: bool) -> 
 
 
 def _write_fleet(
-    file: IO[str], drawn: Iterable[tuple[ErrorModel, Simulated]], digits: int, labelled: bool, attitude: bool
+    file: IO[str],
+    drawn: Iterable[tuple[ErrorModel, SimulatedReadings]],
+    digits: int,
+    labelled: bool,
+    attitude: bool,
 ) -> dict[str, object]:
     """Write the rows of many sensors; return the true parameters by sensor."""
     truth: dict[str, object] = {}
@@ -145,7 +155,9 @@ def _write_fleet(
     return truth
 
 
-def _write(file: IO[str], readings: Simulated, labelled: bool, attitude: bool, first: str = "") -> None:
+def _write(
+    file: IO[str], readings: SimulatedReadings, labelled: bool, attitude: bool, first: str = ""
+) -> None:
     """Write the rows with the shortest digits that read back to the same numbers, each after the text `first`."""
     for pose, output, force in zip(readings.pose, readings.output, readings.force, strict=True):
         cells = [str(pose)] * labelled + [repr(float(v)) for v in output]

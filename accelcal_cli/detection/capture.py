@@ -1,7 +1,7 @@
-"""Poses out of a live stream of readings: what is held, whether it is still, and what has been taken.
+"""Static poses out of a live stream of readings: which pose is held, whether it is still, and which are captured.
 
 Recognising a pose needs a rough sensor before there is a calibration: its output at no acceleration and for 1 g.
-What is not stated is estimated from the poses taken so far, as the sphere nearest to them.
+What is not stated is estimated from the poses captured so far, as the sphere nearest to them.
 """
 
 from __future__ import annotations
@@ -22,20 +22,19 @@ NEAR = 20.0
 """Degrees within which a pose counts as the planned one: faces, edges and corners are 35 or more apart."""
 
 SAME = 10.0
-"""Degrees within which a pose counts as one that has been taken."""
+"""Degrees within which a pose counts as one that is captured already."""
 
 SPHERE_PRIOR = 1e-3
-"""Information a pose lends to the origin as centre of the sphere, relative to its own."""
+"""Weight of the origin as centre of the sphere, relative to that of the poses."""
 
 SPHERE_ROUNDS = 3
-"""Steps towards the centre; each takes off more than nine tenths of the way, also from far outside the sphere."""
-
+"""Steps towards the centre; each goes more than nine tenths of the way, also from far outside the sphere."""
 
 State = Literal["moving", "still", "taken", "again"]
 
 
 @dataclass(frozen=True)
-class Held:
+class CapturedPose:
     """A pose that was held still: n readings, their mean and standard deviation, shapes (3,), output units."""
 
     n: int
@@ -44,7 +43,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Rough:
+class RoughSensor:
     """A rough sensor, one scale factor for all axes.
 
     Attributes:
@@ -57,21 +56,21 @@ class Rough:
 
     def directions(self, output: Float) -> Float:
         """Return the unit directions of outputs, shape (..., 3)."""
-        u = output - self.centre
-        length = np.linalg.norm(u, axis=-1, keepdims=True)
-        unit: Float = u / np.where(length > 0, length, 1.0)
+        force = output - self.centre
+        length = np.linalg.norm(force, axis=-1, keepdims=True)
+        unit: Float = force / np.where(length > 0, length, 1.0)
         return unit
 
 
-def rough_sensor(outputs: Float, scale: float | None, centre: Float | None) -> Rough:
-    """Return the rough sensor of some poses.
+def fit_rough_sensor(outputs: Float, scale: float | None, centre: Float | None) -> RoughSensor:
+    """Return the rough sensor that fits some poses.
 
     Args:
         outputs: mean output of each pose, shape (J, 3), at least one.
         scale: output of 1 g, when stated; centre: output at no acceleration, shape (3,), when stated.
 
-    Where the poses do not tell, the centre is the origin: a sensor whose output at no acceleration is several times
-    that of 1 g has to have its centre stated, or the first poses look alike.
+    Where the poses do not determine it, the centre is the origin: for a sensor whose output at no acceleration is
+    several times that of 1 g, state the centre, or the first poses look alike.
     """
     if centre is None:
         centre = np.zeros(3)
@@ -79,13 +78,13 @@ def rough_sensor(outputs: Float, scale: float | None, centre: Float | None) -> R
             centre = centre + _towards_sphere(outputs - centre)
     if scale is None:
         scale = float(np.median(np.linalg.norm(outputs - centre, axis=1))) or 1.0
-    return Rough(centre, scale)
+    return RoughSensor(centre, scale)
 
 
 def _towards_sphere(outputs: Float) -> Float:
     """Return the step to the centre of the sphere nearest to some points, shape (J, 3).
 
-    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant; the prior holds what the points do not tell.
+    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant; the prior decides what the points do not.
     """
     size = float(np.linalg.norm(outputs, axis=1).max()) or 1.0
     x = outputs / size
@@ -100,9 +99,9 @@ class Status:
     """What the sensor is doing.
 
     Attributes:
-        state: moving; still, and being averaged; taken, just now; again, a pose that has been taken.
+        state: moving; still, and being averaged; taken, just now; again, a pose that is captured already.
         spread: largest standard deviation of the three axes in the window, output units; limit: what counts as still.
-        progress: part of the hold that is done, 0 to 1.
+        progress: part of the hold that is complete, 0 to 1.
         nearest: number of the nearest planned pose; angle: degrees to it.
     """
 
@@ -115,7 +114,11 @@ class Status:
 
 
 class Capture:
-    """Watches a stream of readings and takes the poses that are held still."""
+    """Watches a stream of readings and captures the poses that are held still.
+
+    Attributes:
+        planned: unit directions, shape (P, 3); poses: captured so far.
+    """
 
     def __init__(
         self,
@@ -131,32 +134,32 @@ class Capture:
 
         Args:
             planned: unit directions of the specific force, shape (P, 3).
-            window: readings that stillness is judged by; hold: still readings that make a pose.
+            window: readings that decide on stillness; hold: still readings that make a pose.
             still: largest standard deviation of a still axis, output units; 1 % of 1 g when None.
             scale: output of 1 g; centre: output at no acceleration, shape (3,); estimated when None.
-            unit: one of units.OUTPUT_OF_1_G, which the first pose is held against; None for any other.
+            unit: one of OUTPUT_OF_1_G, which the first pose is checked against; None for any other.
         """
         self.planned, self.hold, self.still = planned, max(hold, window), still
         self.stated, self.unit = (scale, centre), unit
-        self.taken: list[Held] = []
+        self.poses: list[CapturedPose] = []
         self.window = np.zeros((window, 3))
-        self.seen = 0
+        self.count = 0
         self.run: list[Float] = []
         self.done_here = False
-        self.rough: Rough | None = None
+        self.rough: RoughSensor | None = None
 
     def push(self, reading: Float) -> Status | None:
-        """Take in one reading, shape (3,); None while the first window fills.
+        """Add one reading, shape (3,); None while the first window fills.
 
         Raises:
             DataError: the first pose cannot be 1 g in the stated unit; it is not taken.
         """
-        self.window[self.seen % len(self.window)] = reading
-        self.seen += 1
-        if self.seen < len(self.window):
+        self.window[self.count % len(self.window)] = reading
+        self.count += 1
+        if self.count < len(self.window):
             return None
         mean = self.window.mean(axis=0)
-        rough = self.rough or rough_sensor(mean[None], *self.stated)
+        rough = self.rough or fit_rough_sensor(mean[None], *self.stated)
         limit = STILL * rough.scale if self.still is None else self.still
         spread = float((self.window - reading).std(axis=0).max())
         state = self._step(reading, mean, rough, quiet=spread <= limit, limit=limit)
@@ -164,54 +167,49 @@ class Capture:
         nearest, angle = _nearest(direction, self.planned)
         return Status(state, spread, limit, min(len(self.run) / self.hold, 1.0), nearest, angle)
 
-    def _step(self, reading: Float, mean: Float, rough: Rough, *, quiet: bool, limit: float) -> State:
+    def _step(self, reading: Float, mean: Float, rough: RoughSensor, *, quiet: bool, limit: float) -> State:
         if not quiet:
             self.run, self.done_here = [], False
             return "moving"
-        if self.done_here or self._known(rough.directions(mean)):
+        known = self.rough is not None and _nearest(rough.directions(mean), self.directions())[1] < SAME
+        if self.done_here or known:
             self.run = []
             return "again"
         self.run += [reading] if self.run else list(self.window)
         if len(self.run) < self.hold:
             return "still"
-        held = np.array(self.run)
-        if held.std(axis=0).max() > limit:  # it drifts, too slowly for the window to tell
+        readings = np.array(self.run)
+        if readings.std(axis=0).max() > limit:  # it drifts, too slowly for the window to show
             self.run = self.run[-len(self.window) :]
             return "still"
-        away = held - reading  # so that equal readings have no spread, and their own value as mean
-        self._take(Held(len(held), reading + away.mean(axis=0), away.std(axis=0, ddof=1)))
+        away = readings - reading  # so that equal readings have no spread, and their own value as mean
+        self._capture(CapturedPose(len(readings), reading + away.mean(axis=0), away.std(axis=0, ddof=1)))
         return "taken"
 
-    def _take(self, held: Held) -> None:
-        if self.unit is not None and not self.taken:
-            check_unit(held.mean - (0.0 if self.stated[1] is None else self.stated[1]), self.unit)
-        self.taken.append(held)
+    def _capture(self, pose: CapturedPose) -> None:
+        if self.unit is not None and not self.poses:
+            check_unit(pose.mean - (0.0 if self.stated[1] is None else self.stated[1]), self.unit)
+        self.poses.append(pose)
         self.run, self.done_here = [], True
-        self.rough = rough_sensor(np.array([pose.mean for pose in self.taken]), *self.stated)
-
-    def _known(self, direction: Float) -> bool:
-        if self.rough is None:
-            return False
-        return _nearest(direction, self.directions())[1] < SAME
+        self.rough = fit_rough_sensor(np.array([pose.mean for pose in self.poses]), *self.stated)
 
     def directions(self) -> Float:
-        """Return the directions of the poses taken, as far as they are known, shape (J, 3)."""
+        """Return the directions of the captured poses, as far as they are known, shape (J, 3)."""
         if self.rough is None:
             return np.zeros((0, 3))
-        return self.rough.directions(np.array([pose.mean for pose in self.taken]))
+        return self.rough.directions(np.array([pose.mean for pose in self.poses]))
 
     def recognised(self) -> list[int | None]:
-        """Return the planned pose that each pose taken is, None for one beside the plan.
+        """Return the planned pose that each captured pose is, None for one that is not planned.
 
-        Under the latest rough sensor: what an early pose is may become clear with the later ones.
+        By the latest rough sensor: which pose an early one is may become clear with the later ones.
         """
-        found = [_nearest(direction, self.planned) for direction in self.directions()]
-        return [index if angle < NEAR else None for index, angle in found]
+        matches = [_nearest(direction, self.planned) for direction in self.directions()]
+        return [index if angle < NEAR else None for index, angle in matches]
 
     def missing(self) -> list[int]:
-        """Return the planned poses that have not been taken."""
-        there = set(self.recognised())
-        return [index for index in range(len(self.planned)) if index not in there]
+        """Return the planned poses that are not captured yet."""
+        return sorted(set(range(len(self.planned))) - set(self.recognised()))
 
 
 def _nearest(direction: Float, among: Float) -> tuple[int, float]:

@@ -1,10 +1,7 @@
-"""From a raw log to static poses: thresholds tried, the best one kept, close poses merged.
+"""From a raw log to static poses: thresholds are tried, the best one is kept, close poses are merged on request.
 
-What the poses that a threshold finds are worth: a calibration with each, and the threshold to keep.
-
-What to say when a raw log has too few still poses: what was seen, and what would change it.
-
-A quick calibration that tells sets of poses apart: closed form, polish, residual and dilution of precision.
+Each threshold is judged by a quick calibration with the poses that it finds (`screen`): its verdict, and the sigma of
+its worst parameter. Where no threshold finds enough poses, `TooFewPosesError` says what there is and what would help.
 """
 
 from __future__ import annotations
@@ -15,14 +12,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from accelcal_cli.arrays import Int
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.observability import Observability, attitudes, directions_of, information
+from accelcal_cli.calibration.observability import Observability, attitudes, directions_of
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import search, state
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.detection.intervals import Found, Intervals, Ints, Level, find_intervals, find_level, merge
+from accelcal_cli.detection.intervals import (
+    Intervals,
+    Segmentation,
+    StillLevel,
+    find_intervals,
+    find_level,
+    merge,
+)
 from accelcal_cli.detection.rawlog import RawLog
-from accelcal_cli.detection.windows import Envelope, Rows, Spans, read_tiles
+from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, read_tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
@@ -30,17 +35,29 @@ from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
 """Tried when none is stated; [tedaldi2014] tries 2 to 10 times the variance of a marked still period."""
 
+DISTINCT = 5.0
+"""Degrees between attitudes that count as two."""
+
+TIE = 1.05
+"""Sigmas up to this factor apart are the same: the smallest multiplier, the stillest poses, then decides."""
+
+ORDER = ("good", "weak", "undetermined")
+"""Verdicts, the best first."""
+
+MOVING = 0.05
+"""A quietest window that scatters by more than this part of the range of the readings is not still."""
+
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """How poses are found.
+    """How the poses of a log are found.
 
     Attributes:
         spans: window, still period, least length, trim.
-        rate: rows a second, Hz; that of the time column when None.
-        multipliers: of the level; the best one is kept.
+        rate: rows per second, Hz; that of the time column when None.
+        multipliers: of the still level; the best one is kept.
         merge: poses within this angle become one, degrees; thin: only the longest of them stays, degrees.
-        least_poses: attitudes that must be found, candidates.DISTINCT degrees apart.
+        least_poses: attitudes that must be found, DISTINCT degrees apart.
         g: local gravity, m/s^2.
     """
 
@@ -54,13 +71,32 @@ class DetectSettings:
 
 
 @dataclass(frozen=True)
+class CandidateThreshold:
+    """What a multiplier leads to.
+
+    Attributes:
+        multiplier: of the still level; poses: intervals found; attitudes: how many of them differ.
+        rms: of |f| - g of a calibration with them, m/s^2; NaN where there are too few.
+        sigma: of its worst parameter, as m/s^2 at 1 g, as if each attitude counted once; inf where there are too few.
+        verdict: good, weak or undetermined.
+    """
+
+    multiplier: float
+    poses: int
+    attitudes: int
+    rms: float = math.nan
+    sigma: float = math.inf
+    verdict: str = "undetermined"
+
+
+@dataclass(frozen=True)
 class Detection:
     """Static poses of a raw log and how they were found.
 
     Attributes:
         source, sha256, columns: of the log; log_rows: its rows; notes: what a user should know of it.
-        rate: rows a second, Hz, or None; rows: the lengths used.
-        level: what the multipliers multiply; multiplier: the one kept; candidates: all of them.
+        rate: rows per second, Hz, or None; rows: the lengths used.
+        level: what the multipliers apply to; multiplier: the one kept; candidates: all of them.
         intervals: the poses.
         envelope: of the log, for a picture; None unless asked for.
     """
@@ -70,10 +106,10 @@ class Detection:
     columns: tuple[str, str, str]
     log_rows: int
     rate: float | None
-    rows: Rows
-    level: Level
+    rows: RowLengths
+    level: StillLevel
     multiplier: float
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[CandidateThreshold, ...]
     intervals: Intervals
     settings: DetectSettings
     notes: tuple[str, ...]
@@ -87,7 +123,7 @@ class Detection:
         )
 
     def summary(self) -> str:
-        """Say what was found, and with which settings, in one sentence."""
+        """Return what was found, and with which settings, in one sentence."""
         rows = self.rows
         by = "the quietest windows" if rows.still is None else f"the first {rows.still:,} rows"
         tried = f", the best of {len(self.candidates)}" if len(self.candidates) > 1 else ""
@@ -99,16 +135,16 @@ class Detection:
 
 
 class TooFewPosesError(DataError):
-    """No multiplier finds attitudes enough; `found` is what the one that comes nearest finds."""
+    """No multiplier finds enough attitudes; `detection` is that of the multiplier that comes nearest."""
 
-    def __init__(self, message: str, found: Detection) -> None:
-        """Keep what was found, for a picture."""
+    def __init__(self, message: str, detection: Detection) -> None:
+        """Keep the detection, for a picture."""
         super().__init__(message)
-        self.found = found
+        self.detection = detection
 
 
 def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Detection:
-    """Find the static poses of a raw log in one pass.
+    """Find the static poses of a raw log in one pass; with `picture` keep its envelope.
 
     Of several multipliers the one is kept whose calibration has the least sigma in its worst parameter, among those
     of the best verdict with enough attitudes: a longer list of poses counts only as far as the attitudes differ.
@@ -116,18 +152,18 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
 
     Raises:
         UsageError: lengths that do not fit the log. DataError: unreadable.
-        TooFewPosesError: it says what was seen.
+        TooFewPosesError: no multiplier finds enough attitudes; the message says what was found.
     """
     rate = settings.rate if settings.rate is not None else log.clock.rate
-    rows = settings.spans.rows(rate)
-    envelope = Envelope(rows.tile) if picture else None
-    tiles = read_tiles(log, rows, envelope)
-    level = find_level(tiles, rows, log.name)
-    found = find_intervals(tiles, rows, level, settings.multipliers)
-    candidates = tuple(judge(f, settings.g) for f in found)
+    lengths = settings.spans.rows(rate)
+    envelope = Envelope(lengths.tile) if picture else None
+    tiles = read_tiles(log, lengths, envelope)
+    level = find_level(tiles, lengths, log.name)
+    segmentations = find_intervals(tiles, lengths, level, settings.multipliers)
+    candidates = tuple(evaluate(segmentation, settings.g) for segmentation in segmentations)
     enough = [k for k, c in enumerate(candidates) if c.attitudes >= settings.least_poses]
-    kept = best(enough, candidates) if enough else nearest(found, candidates)
-    intervals = found[kept].intervals
+    kept = best(enough, candidates) if enough else nearest(segmentations, candidates)
+    intervals = segmentations[kept].intervals
     gaps = tiles.gaps.notes(log.clock.unit)
     detection = Detection(
         source=log.name,
@@ -135,22 +171,54 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         columns=log.columns.names,
         log_rows=tiles.rows,
         rate=rate,
-        rows=rows,
+        rows=lengths,
         level=level,
         multiplier=candidates[kept].multiplier,
         candidates=candidates,
-        intervals=_thinned(intervals, settings) if enough else intervals,
+        intervals=_combine(intervals, settings) if enough else intervals,
         settings=settings,
         notes=(*log.notes, *gaps),
         envelope=envelope,
     )
     if not enough:
-        why = too_few(found, candidates, level, rows, settings.least_poses)
+        why = explain_too_few(segmentations[kept], candidates[kept], detection)
         raise TooFewPosesError("; ".join([f"{log.name}: {why}", *gaps]), detection)
     return detection
 
 
-def _thinned(intervals: Intervals, settings: DetectSettings) -> Intervals:
+def evaluate(segmentation: Segmentation, g: float) -> CandidateThreshold:
+    """Calibrate with the intervals of a threshold, at local gravity g, m/s^2."""
+    multiplier, intervals = segmentation.multiplier, segmentation.intervals
+    poses = len(intervals)
+    if poses < 2 or not np.ptp(intervals.mean, axis=0).any():
+        return CandidateThreshold(multiplier, poses, min(poses, 1))
+    fit = screen(readings_of(intervals, "log"), g)
+    distinct = len(attitudes(directions_of(intervals.mean, fit.model), intervals.n, DISTINCT))
+    sigma = float(fit.s * fit.dop * np.sqrt(poses / distinct))
+    return CandidateThreshold(
+        multiplier, poses, distinct, fit.rms, sigma if math.isfinite(sigma) else math.inf, fit.verdict
+    )
+
+
+def best(enough: Sequence[int], candidates: Sequence[CandidateThreshold]) -> int:
+    """Return which of the candidates numbered in `enough` to keep: best verdict, then least sigma, then stillest."""
+    verdict = min(ORDER.index(candidates[k].verdict) for k in enough)
+    enough = [k for k in enough if candidates[k].verdict == ORDER[verdict]]
+    least = min(candidates[k].sigma for k in enough)
+    return min(
+        (k for k in enough if candidates[k].sigma <= TIE * least), key=lambda k: candidates[k].multiplier
+    )
+
+
+def nearest(segmentations: Sequence[Segmentation], candidates: Sequence[CandidateThreshold]) -> int:
+    """Return which of several multipliers comes nearest to enough poses."""
+    return max(
+        range(len(candidates)),
+        key=lambda k: (candidates[k].attitudes, candidates[k].poses, len(segmentations[k].turning)),
+    )
+
+
+def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
     """Merge or thin poses that are closer than the stated angle."""
     angle = settings.merge if settings.merge is not None else settings.thin
     if angle is None:
@@ -163,93 +231,62 @@ def _thinned(intervals: Intervals, settings: DetectSettings) -> Intervals:
     return merge(intervals, groups)
 
 
-DISTINCT = 5.0
-"""Degrees between attitudes that count as two."""
-
-TIE = 1.05
-"""Sigmas up to this factor apart are the same: the smallest multiplier, the stillest poses, then decides."""
-
-ORDER = ("good", "weak", "undetermined")
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """What a multiplier leads to.
-
-    Attributes:
-        multiplier: of the level; poses: intervals found; attitudes: how many of them differ.
-        rms: of |f| - g of a calibration with them, m/s^2; NaN where there are too few.
-        sigma: of its worst parameter, as m/s^2 at 1 g, as if each attitude counted once; inf where there are too few.
-        verdict: good, weak or undetermined.
-    """
-
-    multiplier: float
-    poses: int
-    attitudes: int
-    rms: float = float("nan")
-    sigma: float = float("inf")
-    verdict: str = "undetermined"
-
-
-def judge(found: Found, g: float) -> Candidate:
-    """Calibrate with what a multiplier found, at local gravity g, m/s^2."""
-    intervals = found.intervals
-    seen = Candidate(found.multiplier, len(intervals), min(len(intervals), 1))
-    if len(intervals) < 2 or not np.ptp(intervals.mean, axis=0).any():
-        return seen
-    fit = screen(readings_of(intervals, "log"), g)
-    distinct = len(attitudes(directions_of(intervals.mean, fit.model), intervals.n, DISTINCT))
-    sigma = fit.s * fit.dop * np.sqrt(len(intervals) / distinct)
-    return replace(
-        seen,
-        attitudes=distinct,
-        rms=fit.rms,
-        sigma=float(sigma) if np.isfinite(sigma) else float("inf"),
-        verdict=fit.verdict,
-    )
-
-
-def best(enough: Sequence[int], candidates: Sequence[Candidate]) -> int:
-    """Return which of the candidates numbered in `enough` to keep: best verdict, then least sigma, then stillest."""
-    verdict = min(ORDER.index(candidates[k].verdict) for k in enough)
-    enough = [k for k in enough if candidates[k].verdict == ORDER[verdict]]
-    least = min(candidates[k].sigma for k in enough)
-    return min(
-        (k for k in enough if candidates[k].sigma <= TIE * least), key=lambda k: candidates[k].multiplier
-    )
-
-
 def readings_of(intervals: Intervals, source: str) -> Readings:
     """Return the intervals as readings: mean, count and scatter of each."""
     return Readings.from_array(intervals.mean, source=source, count=intervals.n, scatter=intervals.scatter)
 
 
-MOVING = 0.05
-"""A quietest window that scatters by more than this part of the range of the readings is not still."""
-
-
-def nearest(found: Sequence[Found], candidates: Sequence[Candidate]) -> int:
-    """Return which of several multipliers comes nearest to poses enough."""
-    return max(
-        range(len(found)), key=lambda k: (candidates[k].attitudes, candidates[k].poses, len(found[k].turning))
+def explain_too_few(segmentation: Segmentation, count: CandidateThreshold, detection: Detection) -> str:
+    """Say why no multiplier finds enough attitudes, and what would help, by what the nearest one leads to."""
+    level, least, multiplier = detection.level, detection.settings.least_poses, count.multiplier
+    poses, alike = _counted(count.poses, "still pose"), _counted(count.attitudes, "attitude")
+    return "; ".join(
+        [
+            f"{poses} in {alike}, fewer than {least}"
+            if count.poses
+            else f"no still pose, {least} are needed",
+            f"quietest variance {level.quietest:.4g}, threshold {multiplier * level.variance:.4g} "
+            f"(multiplier {multiplier:g})",
+            _describe_lengths(segmentation, detection.rows),
+            _advise(segmentation, count, detection),
+        ]
     )
 
 
-def too_few(
-    found: Sequence[Found], candidates: Sequence[Candidate], level: Level, rows: Rows, least: int
-) -> str:
-    """Say why no multiplier finds `least` attitudes, and what would help."""
-    best = nearest(found, candidates)
-    seen, count = found[best], candidates[best]
-    threshold = seen.multiplier * level.variance
-    poses, alike = _counted(count.poses, "still pose"), _counted(count.attitudes, "attitude")
-    parts = [
-        f"{poses} in {alike}, fewer than {least}" if count.poses else f"no still pose, {least} are needed",
-        f"quietest variance {level.quietest:.4g}, threshold {threshold:.4g} (multiplier {seen.multiplier:g})",
-        _lengths(seen, rows),
-        _advice(seen, count, level, rows, [f.multiplier for f in found], least),
-    ]
+def _describe_lengths(segmentation: Segmentation, rows: RowLengths) -> str:
+    short, turning = segmentation.short, segmentation.turning
+    whole = [n + 2 * rows.trim for n in segmentation.intervals.n.tolist()] + short.tolist()
+    if not whole and not len(turning):
+        return "no window is below it"
+    parts = []
+    if whole:
+        parts.append(
+            f"longest still stretch {max(whole):,} rows, of which {rows.trim:,} are trimmed off each end"
+        )
+    if len(short):
+        parts.append(f"{_stretches(short)} too short for a least length of {rows.least:,}")
+    if len(turning):
+        parts.append(f"{_stretches(turning)} left out because the sensor turns while they last")
     return "; ".join(parts)
+
+
+def _advise(segmentation: Segmentation, count: CandidateThreshold, detection: Detection) -> str:
+    """Name the setting, or the handling, that most likely helps."""
+    level, least = detection.level, detection.settings.least_poses
+    short, turning = segmentation.short, segmentation.turning
+    restless = math.sqrt(level.quietest) > MOVING * level.extent
+    if count.poses >= least and not (restless and len(turning)):
+        return "turn the sensor to more attitudes, or accept fewer with --min-poses"
+    if restless:
+        scatter = f"{math.sqrt(level.quietest):.3g} where the readings change by {level.extent:.3g}"
+        return f"no part of the log is still: even its quietest window scatters by {scatter}"
+    if len(turning) > count.poses:
+        return "put the sensor down, or hold it against something, in each pose: it turns slowly all the time"
+    if count.poses + np.count_nonzero(short > 1.5 * detection.rows.window) >= least:
+        return "hold each pose longer, or lower --min-length or --trim"
+    highest = max(detection.settings.multipliers)
+    beyond = f"--multiplier above {highest:g}, a shorter --window or a lower --min-length"
+    return f"record more poses held still; if the log has more, try {beyond}"
 
 
 def _counted(number: int, what: str) -> str:
@@ -257,44 +294,10 @@ def _counted(number: int, what: str) -> str:
     return f"{number:,} {what}{plural}"
 
 
-def _lengths(seen: Found, rows: Rows) -> str:
-    whole = [n + 2 * rows.trim for n in seen.intervals.n.tolist()] + seen.short.tolist()
-    if not whole and not len(seen.turning):
-        return "no window is below it"
-    parts = []
-    if whole:
-        parts.append(
-            f"longest still stretch {max(whole):,} rows, of which {rows.trim:,} are trimmed off each end"
-        )
-    if len(seen.short):
-        parts.append(f"{_stretches(seen.short)} too short for a least length of {rows.least:,}")
-    if len(seen.turning):
-        parts.append(f"{_stretches(seen.turning)} left out because the sensor turns while they last")
-    return "; ".join(parts)
-
-
-def _stretches(lengths: Ints) -> str:
+def _stretches(lengths: Int) -> str:
     low, high = int(lengths.min()), int(lengths.max())
     span = f"{low:,}" if low == high else f"{low:,} to {high:,}"
     return f"{_counted(len(lengths), 'stretch')} of {span} rows"
-
-
-def _advice(
-    seen: Found, count: Candidate, level: Level, rows: Rows, multipliers: Sequence[float], least: int
-) -> str:
-    """Name the setting, or the handling, that most likely helps."""
-    restless = math.sqrt(level.quietest) > MOVING * level.extent
-    if count.poses >= least and not (restless and len(seen.turning)):
-        return "turn the sensor to more attitudes, or accept fewer with --min-poses"
-    if restless:
-        scatter = f"{math.sqrt(level.quietest):.3g} where the readings change by {level.extent:.3g}"
-        return f"no part of the log is still: even its quietest window scatters by {scatter}"
-    if len(seen.turning) > count.poses:
-        return "put the sensor down, or hold it against something, in each pose: it turns slowly all the time"
-    if count.poses + np.count_nonzero(seen.short > 1.5 * rows.window) >= least:
-        return "hold each pose longer, or lower --min-length or --trim"
-    beyond = f"--multiplier above {max(multipliers):g}, a shorter --window or a lower --min-length"
-    return f"record more poses held still; if the log has more, try {beyond}"
 
 
 @dataclass(frozen=True)
@@ -321,7 +324,7 @@ def screen(readings: Readings, g: float) -> Screened:
     if plain.start.sources[0] == "sphere":
         # Where the poses determine no more than the nearest sphere, no search has to find that out.
         middle = np.zeros_like(plain.cost.box.centre)
-        if Observability.of(information(plain.cost, middle)[0], readings.poses).verdict == "undetermined":
+        if Observability.of(plain.cost.information(middle)[0], readings.poses).verdict == "undetermined":
             K, D = plain.cost.parameters(middle)
             return Screened(ErrorModel(K[0], D[0]), np.nan, np.nan, np.inf, "undetermined")
     result = fit(search(state(sample, settings), closed=True))

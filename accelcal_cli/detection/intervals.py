@@ -1,30 +1,53 @@
-"""Still intervals of a raw log: where they are, and mean and scatter of their readings.
+"""Where a raw log is still: windows of little variance, in runs that last, and what is measured in them.
 
-Lengths of time in a raw log: stated in seconds or in rows, used in rows.
+A window is still when the norm of the variances of the three axes is at most a multiple of that of a still period
+[tedaldi2014] section IV-B; the still period is stated, or the quietest windows take its place (`StillLevel`). With a
+gyroscope the window must not turn either: slow rotation moves gravity less than the noise of a cheap accelerometer
+hides. Runs of still windows, trimmed at both ends, are the `Intervals`, of which mean and scatter are measured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from accelcal_cli.arrays import Float
-from accelcal_cli.detection.windows import Rows, Tiles
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.detection.windows import RowLengths, Tiles, Windows, windows
 from accelcal_cli.errors import DataError
 
-Ints = NDArray[np.int64]
 Moments = tuple[Float, Float, Float]
+"""Rows (I,), mean (I, 3) and squares about it (I, 3) of I sets of rows."""
 
 STEADY = 0.04
 """Halves of a pose have means that differ by less than this part of half the range of the readings, about 1 g: 2.3
 degrees, or 5 degrees turned from end to end."""
 
 BEYOND_NOISE = 5.0
-"""Sigmas that halves have to differ by before it is no longer noise, or the beat of a vibration."""
+"""Sigmas by which halves have to differ before it is no longer noise, or the beat of a vibration."""
+
+SAMPLE = 100_000
+"""At most about this many windows decide the levels."""
+
+FEWEST_QUIET, MOST_QUIET = 0.002, 0.02
+"""Part of the windows that count as the quietest: what STILL_POSES of the least length would fill, in these limits."""
+
+STILL_POSES = 12
+
+ACCELEROMETER_QUIET = 2.0
+"""Windows up to this multiple of the quietest variance show what a gyroscope reads at rest."""
+
+MOST_TURNING = 0.75
+"""Part of those windows that turn at most as much as the level."""
+
+ROUNDING = 1e-13
+"""A standard deviation below this part of the readings is rounding: a sensor without noise, or one that is stuck."""
+
+NOT_STILL = 100.0
+"""A stated still period of more than this multiple of the quietest variance is not still."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +61,9 @@ class Intervals:
         time: of first and last row, shape (I, 2), as in the log; None without.
     """
 
-    start: Ints
-    end: Ints
-    n: Ints
+    start: Int
+    end: Int
+    n: Int
     mean: Float
     scatter: Float
     time: Float | None = None
@@ -49,7 +72,7 @@ class Intervals:
         """I."""
         return len(self.n)
 
-    def take(self, index: NDArray[np.intp]) -> Intervals:
+    def take(self, index: Int) -> Intervals:
         """Return the intervals at `index`."""
         return Intervals(
             self.start[index],
@@ -61,15 +84,15 @@ class Intervals:
         )
 
     def where(self, i: int) -> str:
-        """How to name an interval (from 0) to the user: ``rows 888 to 1357``, or by its times."""
+        """Return how to name an interval (from 0) to the user: ``rows 888 to 1357``, or by its times."""
         if self.time is not None:
             return f"time {self.time[i, 0]:.10g} to {self.time[i, 1]:.10g}"
         return f"rows {self.start[i]} to {self.end[i]}"
 
 
 @dataclass(frozen=True)
-class Found:
-    """What one multiplier finds.
+class Segmentation:
+    """The still intervals of a log at one threshold.
 
     Attributes:
         multiplier: of the level.
@@ -80,34 +103,163 @@ class Found:
 
     multiplier: float
     intervals: Intervals
-    short: Ints
-    turning: Ints
+    short: Int
+    turning: Int
 
 
-def find_intervals(tiles: Tiles, rows: Rows, level: Level, multipliers: Sequence[float]) -> list[Found]:
+@dataclass(frozen=True)
+class StillLevel:
+    """What counts as still, before it is multiplied.
+
+    Attributes:
+        variance: norm of the variances of the three axes, (sensor units)^2.
+        quietest: that of the quietest windows; `variance` is the same, or that of a stated still period.
+        extent: half the range of the readings, the outermost hundredths left out, sensor units.
+        turning: mean square of the turning rate about its bias, (gyroscope units)^2; inf without a gyroscope.
+        bias: of the gyroscope, shape (3,).
+    """
+
+    variance: float
+    quietest: float
+    extent: float
+    turning: float
+    bias: Float
+
+
+def find_intervals(
+    tiles: Tiles, lengths: RowLengths, level: StillLevel, multipliers: Sequence[float]
+) -> list[Segmentation]:
     """Return the still intervals of a log for every multiplier of the level."""
-    firsts, lasts = runs(tiles, rows, level, multipliers)
-    ends = [_trimmed(first, last, rows) for first, last in zip(firsts, lasts, strict=True)]
+    runs = find_runs(tiles, lengths, level, multipliers)
+    ends = [_trim(first, last, lengths) for first, last in runs]
     edges = [edge for a, b in ends for edge in (a, (a + b) // 2, b)]
-    measured = Atoms.of(tiles, np.unique(np.concatenate(edges)))
-    found = []
-    for k, (a, b) in enumerate(ends):
-        enough = (b - a) * tiles.size >= rows.least
+    pieces = Pieces.of(tiles, np.unique(np.concatenate(edges)))
+    segmentations = []
+    for multiplier, (first, last), (a, b) in zip(multipliers, runs, ends, strict=True):
+        enough = (b - a) * tiles.size >= lengths.least
         turning = enough.copy()
-        turning[enough] = measured.turning(a[enough], b[enough], level.extent)
-        still, whole = enough & ~turning, (lasts[k] - firsts[k] + rows.width) * tiles.size
-        intervals = measured.intervals(a[still], b[still])
-        found.append(Found(multipliers[k], intervals, whole[~enough], whole[turning]))
-    return found
+        turning[enough] = pieces.turning(a[enough], b[enough], level.extent)
+        still, whole = enough & ~turning, (last - first + lengths.width) * tiles.size
+        intervals = pieces.intervals(a[still], b[still])
+        segmentations.append(Segmentation(multiplier, intervals, whole[~enough], whole[turning]))
+    return segmentations
 
 
-def _trimmed(first: Ints, last: Ints, rows: Rows) -> tuple[Ints, Ints]:
+def find_level(tiles: Tiles, lengths: RowLengths, name: str) -> StillLevel:
+    """Return what counts as still.
+
+    Args:
+        tiles: the log; name: of it, for messages.
+        lengths: of window, still period and least interval.
+
+    Raises:
+        DataError: a log shorter than the window or without any noise, a stated still period that is not still.
+    """
+    count = tiles.count - lengths.width + 1
+    if count < 1:
+        raise DataError(
+            f"{name}: has {tiles.rows:,} rows, fewer than one window of {lengths.window:,}; "
+            "means of poses at rest go to accelcal calibrate as they are"
+        )
+    sample = list(windows(tiles, lengths.width, -(-count // SAMPLE)))
+    mean, variance = np.concatenate([w.mean for w in sample]), np.concatenate([w.variance for w in sample])
+    noisy = variance > (ROUNDING * float(np.abs(mean).max())) ** 2
+    if not noisy.any():
+        raise DataError(
+            f"{name}: all readings are equal, or change only in steps; the sensor has to be turned"
+        )
+    part = np.clip(STILL_POSES * lengths.least / tiles.rows, FEWEST_QUIET, MOST_QUIET)
+    quietest = float(np.quantile(variance[noisy], part))
+    level = quietest if lengths.still is None else _still_period(tiles, lengths, quietest, name)
+    extent = 0.5 * float(np.ptp(np.quantile(mean, [0.01, 0.99], axis=0), axis=0).max())
+    if not tiles.gyro:
+        return StillLevel(level, quietest, extent, np.inf, np.zeros(3))
+    return StillLevel(level, quietest, extent, *_turning(sample, variance <= ACCELEROMETER_QUIET * quietest))
+
+
+def _turning(sample: Sequence[Windows], calm: Bool) -> tuple[float, Float]:
+    """Return the level of the gyroscope and its bias, from the windows that the accelerometer calls calm."""
+    rate = np.concatenate([w.rate for w in sample])[calm]
+    bias: Float = np.median(rate, axis=0)
+    square = np.concatenate([w.turning(bias) for w in sample])[calm]
+    return float(np.quantile(square, MOST_TURNING)), bias
+
+
+def _still_period(tiles: Tiles, lengths: RowLengths, quietest: float, name: str) -> float:
+    """Return the norm of the variances over the stated still period at the beginning."""
+    still = lengths.still or 0
+    wanted = still // tiles.size
+    if still > tiles.rows:
+        raise DataError(
+            f"{name}: has {tiles.rows:,} rows, fewer than the still period of {still:,} (--still)"
+        )
+    begin = takewhile(lambda numbered: numbered[0] < wanted, tiles.blocks())
+    block = np.concatenate([block[: wanted - first, :6] for first, block in begin])
+    mean = block[:, :3].mean(axis=0)
+    square = block[:, 3:6].sum(axis=0) + tiles.size * ((block[:, :3] - mean) ** 2).sum(axis=0)
+    level = float(np.linalg.norm(square / (len(block) * tiles.size)))
+    if not 0 < level <= NOT_STILL * quietest:
+        raise DataError(
+            f"{name}: the first {still:,} rows are not still: variance {level:.4g}, {level / quietest:.3g} times "
+            f"that of the quietest windows ({quietest:.4g}); state a shorter --still, or leave it out"
+        )
+    return level
+
+
+def find_runs(
+    tiles: Tiles, lengths: RowLengths, level: StillLevel, multipliers: Sequence[float]
+) -> list[tuple[Int, Int]]:
+    """Return for every multiplier the first and the last window, shape (I,) each, of every run of still windows."""
+    changes: list[list[Int]] = [[] for _ in multipliers]
+    still_before = np.zeros(len(multipliers), dtype=bool)
+    for block in windows(tiles, lengths.width):
+        turning = block.turning(level.bias)
+        whole = ~block.broken  # what happened in a gap is unknown
+        for k, multiplier in enumerate(multipliers):
+            calm = (block.variance <= multiplier * level.variance) & (turning <= multiplier * level.turning)
+            still = whole & calm
+            changes[k].append(np.flatnonzero(np.diff(still, prepend=still_before[k])) + block.first)
+            still_before[k] = still[-1]
+    end = np.array([tiles.count - lengths.width + 1])
+    edges = [
+        np.concatenate([*parts, end[: int(last)]]) for parts, last in zip(changes, still_before, strict=True)
+    ]
+    return [(edge[::2], edge[1::2] - 1) for edge in edges]
+
+
+def merge(intervals: Intervals, groups: Sequence[Int]) -> Intervals:
+    """Return one interval for each group: it spans them all, and its rows are theirs taken together."""
+    first = np.array([group.min() for group in groups], dtype=np.intp)
+    last = np.array([group.max() for group in groups], dtype=np.intp)
+    n, mean, scatter = [], [], []
+    for group in groups:
+        rows, centre = intervals.n[group], intervals.mean[group]
+        total = rows.sum()
+        middle = (rows[:, None] * centre).sum(axis=0) / total
+        within = ((rows - 1)[:, None] * intervals.scatter[group] ** 2).sum(axis=0)
+        n.append(total)
+        mean.append(middle)
+        # Scatter within the intervals: how they differ is the attitude's, not the noise of a reading.
+        scatter.append(np.sqrt(within / max(total - len(group), 1)))
+    time = intervals.time
+    spans = None if time is None else np.stack([time[first, 0], time[last, 1]], axis=1)
+    return replace(
+        intervals.take(first),
+        end=intervals.end[last],
+        n=np.array(n),
+        mean=np.array(mean),
+        scatter=np.array(scatter),
+        time=spans,
+    )
+
+
+def _trim(first: Int, last: Int, lengths: RowLengths) -> tuple[Int, Int]:
     """Return first tile and end tile of each run of windows, without its edges.
 
-    The windows of two runs may share tiles; the middle of what they share parts them.
+    The windows of two runs may share tiles; the middle of what they share divides them.
     """
-    trim = -(-rows.trim // rows.tile)
-    a, b = first + trim, last + rows.width - trim
+    trim = -(-lengths.trim // lengths.tile)
+    a, b = first + trim, last + lengths.width - trim
     middle = (a[1:] + b[:-1]) // 2
     overlap = b[:-1] > a[1:]
     b[:-1] = np.where(overlap, middle, b[:-1])
@@ -116,22 +268,22 @@ def _trimmed(first: Ints, last: Ints, rows: Rows) -> tuple[Ints, Ints]:
 
 
 @dataclass(frozen=True)
-class Atoms:
-    """Stretches of tiles between all ends of intervals that any multiplier gives, each measured once.
+class Pieces:
+    """Runs of tiles between neighbouring ends of the intervals of all multipliers, each measured once.
 
     Attributes:
-        tile: rows of a tile; edge: first tile of each atom, and the end of the last, shape (A + 1,).
-        moments: rows, mean and squares about it of each atom, shapes (A,), (A, 3), (A, 3).
-        time: of the first and last row of each atom, shape (A, 2), or None.
+        tile: rows of a tile; edge: first tile of each piece, and the end of the last, shape (A + 1,).
+        moments: rows, mean and squares about it of each piece, shapes (A,), (A, 3), (A, 3).
+        time: of the first and last row of each piece, shape (A, 2), or None.
     """
 
     tile: int
-    edge: Ints
+    edge: Int
     moments: Moments
     time: Float | None
 
     @classmethod
-    def of(cls, tiles: Tiles, edge: Ints) -> Self:
+    def of(cls, tiles: Tiles, edge: Int) -> Self:
         """Read the tiles between the edges, in one pass."""
         a, b = edge[:-1], edge[1:]
         count, mean, square = np.zeros(len(a)), np.zeros((len(a), 3)), np.zeros((len(a), 3))
@@ -142,23 +294,23 @@ class Atoms:
             if not len(here):
                 continue
             rows = np.full(len(block), float(tiles.size))
-            part = _together((rows, block[:, :3], block[:, 3:6]), low[here], high[here])
-            count[here], mean[here], square[here] = _joined((count[here], mean[here], square[here]), part)
+            part = _pool((rows, block[:, :3], block[:, 3:6]), low[here], high[here])
+            count[here], mean[here], square[here] = _pool_two((count[here], mean[here], square[here]), part)
             if tiles.timed:
                 begins = here[a[here] >= first]
                 time[begins, 0] = block[low[begins], -2]
                 time[here, 1] = block[high[here] - 1, -1]
         return cls(tiles.size, edge, (count, mean, square), time if tiles.timed else None)
 
-    def intervals(self, a: Ints, b: Ints) -> Intervals:
+    def intervals(self, a: Int, b: Int) -> Intervals:
         """Return the intervals of tiles a to b - 1, each shape (I,); a and b are edges."""
         low, high = np.searchsorted(self.edge, a), np.searchsorted(self.edge, b)
-        count, mean, square = _together(self.moments, low, high)
+        count, mean, square = _pool(self.moments, low, high)
         scatter = np.sqrt(square / np.maximum(count - 1, 1)[:, None])
         time = None if self.time is None else np.stack([self.time[low, 0], self.time[high - 1, 1]], axis=1)
-        return Intervals(a * self.tile + 1, b * self.tile, count.astype(np.int64), mean, scatter, time)
+        return Intervals(a * self.tile + 1, b * self.tile, count.astype(np.intp), mean, scatter, time)
 
-    def turning(self, a: Ints, b: Ints, extent: float) -> NDArray[np.bool_]:
+    def turning(self, a: Int, b: Int, extent: float) -> Bool:
         """Return which of the intervals of tiles a to b - 1, each shape (I,), turn while they last.
 
         Args:
@@ -174,7 +326,7 @@ class Atoms:
         return turning
 
 
-def _together(items: Moments, low: Ints, high: Ints) -> Moments:
+def _pool(items: Moments, low: Int, high: Int) -> Moments:
     """Return rows (I,), mean (I, 3) and squares about it (I, 3) of the items low to high - 1 taken together."""
     number = high - low
     if not len(number):
@@ -191,219 +343,9 @@ def _together(items: Moments, low: Ints, high: Ints) -> Moments:
     return total, centre + shift, np.add.reduceat(square + rows[:, None] * off * off, begin)
 
 
-def _joined(one: Moments, two: Moments) -> Moments:
+def _pool_two(one: Moments, two: Moments) -> Moments:
     """Return the moments of two sets of rows taken together."""
     n = one[0] + two[0]
     part = (two[0] / n)[:, None]
     step = two[1] - one[1]
     return n, one[1] + step * part, one[2] + two[2] + step**2 * part * one[0][:, None]
-
-
-def merge(intervals: Intervals, groups: Sequence[Ints]) -> Intervals:
-    """Return one interval for each group: it spans them all, and its rows are theirs taken together."""
-    first = np.array([group.min() for group in groups], dtype=np.intp)
-    last = np.array([group.max() for group in groups], dtype=np.intp)
-    n, mean, square = [], [], []
-    for group in groups:
-        rows, centre = intervals.n[group], intervals.mean[group]
-        total = rows.sum()
-        middle = (rows[:, None] * centre).sum(axis=0) / total
-        within = ((rows - 1)[:, None] * intervals.scatter[group] ** 2).sum(axis=0)
-        n.append(total)
-        mean.append(middle)
-        # Scatter within the intervals: how they differ is the attitude's, not the noise of a reading.
-        square.append(np.sqrt(within / max(total - len(group), 1)))
-    time = intervals.time
-    spans = None if time is None else np.stack([time[first, 0], time[last, 1]], axis=1)
-    joined = replace(intervals.take(first), end=intervals.end[last], time=spans)
-    return replace(joined, n=np.array(n), mean=np.array(mean), scatter=np.array(square))
-
-
-SAMPLE = 100_000
-"""At most about this many windows decide the levels."""
-
-
-FEWEST_QUIET, MOST_QUIET = 0.002, 0.02
-"""Part of the windows that count as the quietest: what 12 poses of the least length would fill, in these limits."""
-
-
-STILL_POSES = 12
-
-
-ACCELEROMETER_QUIET = 2.0
-"""Windows up to this multiple of the quietest variance tell how much a gyroscope turns at rest."""
-
-
-MOST_TURNING = 0.75
-"""Part of those windows that turn no more than the level."""
-
-
-ROUNDING = 1e-13
-"""A standard deviation below this part of the readings is rounding: a sensor without noise, or one that is stuck."""
-
-
-NOT_STILL = 100.0
-"""A stated still period of more than this multiple of the quietest variance is not still."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """What counts as still, before it is multiplied.
-
-    Attributes:
-        variance: norm of the variances of the three axes, (sensor units)^2.
-        quietest: the same of the quietest windows, where `variance` is that of a stated still period.
-        extent: half the range of the readings, the outermost hundredths left out, sensor units.
-        turning: mean square of the turning rate about its bias, (gyroscope units)^2; inf without a gyroscope.
-        bias: of the gyroscope, shape (3,).
-    """
-
-    variance: float
-    quietest: float
-    extent: float
-    turning: float
-    bias: Float
-
-
-@dataclass(frozen=True)
-class Windows:
-    """A block of sliding windows, one a tile.
-
-    Attributes:
-        first: number of the first window, that of its first tile.
-        mean: shape (B, 3); variance: norm of the variances, shape (B,).
-        rate: mean of the gyroscope, shape (B, 3); spread: sum of its variances, shape (B,).
-        broken: whether there is a gap in time in it, shape (B,).
-    """
-
-    first: int
-    mean: Float
-    variance: Float
-    rate: Float
-    spread: Float
-    broken: NDArray[np.bool_]
-
-    def turning(self, bias: Float) -> Float:
-        """Return the mean square of the turning rate about its bias, shape (B,)."""
-        turning: Float = self.spread + ((self.rate - bias) ** 2).sum(axis=1)
-        return turning
-
-
-def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
-    """Yield every `step`-th window of `width` tiles, block by block."""
-    for first, block in tiles.blocks(overlap=width - 1):
-        if len(block) < width:
-            continue
-        start = (-first) % step
-        take = slice(start, len(block) - width + 1, step)
-        mean, variance = _window(block[:, :6], tiles.size, width, take)
-        rate, spread = np.zeros_like(variance), np.zeros(variance.shape[1])
-        if tiles.gyro:
-            rate, turned = _window(block[:, 6:12], tiles.size, width, take)
-            spread = turned.sum(axis=0)
-        broken = np.zeros(variance.shape[1], dtype=bool)
-        if tiles.timed:
-            broken = tiles.gaps.limit.spanned(block[:, -2], block[:, -1], width)[start::step]
-        norm = np.sqrt(variance[0] ** 2 + variance[1] ** 2 + variance[2] ** 2)
-        yield Windows(first + start, mean.T, norm, rate.T, spread, broken)
-
-
-def _window(moments: Float, size: int, width: int, take: slice) -> tuple[Float, Float]:
-    """Return mean and variance, each (3, windows), of the windows of `width` tiles that begin at `take`."""
-    parts = [moments[take.start + k : take.stop + k : take.step].T.copy() for k in range(width)]
-    centre: Float = np.add.reduce([part[:3] for part in parts]) / width
-    square = np.zeros_like(centre)
-    for part in parts:
-        off = part[:3] - centre
-        square += part[3:] + size * off * off
-    return centre, square / (size * width)
-
-
-def find_level(tiles: Tiles, rows: Rows, name: str) -> Level:
-    """Return what counts as still.
-
-    Args:
-        tiles: the log; name: of it, for messages.
-        rows: lengths of window, still period and least interval.
-
-    Raises:
-        DataError: a log shorter than the window or without any noise, a stated still period that is not still.
-    """
-    count = tiles.count - rows.width + 1
-    if count < 1:
-        raise DataError(
-            f"{name}: has {tiles.rows:,} rows, fewer than one window of {rows.window:,}; "
-            "means of poses at rest go to accelcal calibrate as they are"
-        )
-    sample = list(windows(tiles, rows.width, -(-count // SAMPLE)))
-    mean, variance = np.concatenate([w.mean for w in sample]), np.concatenate([w.variance for w in sample])
-    noisy = variance > (ROUNDING * float(np.abs(mean).max())) ** 2
-    if not noisy.any():
-        raise DataError(
-            f"{name}: all readings are equal, or change only in steps; the sensor has to be turned"
-        )
-    part = np.clip(STILL_POSES * rows.least / tiles.rows, FEWEST_QUIET, MOST_QUIET)
-    quietest = float(np.quantile(variance[noisy], part))
-    level = quietest if rows.still is None else _still_period(tiles, rows, quietest, name)
-    extent = 0.5 * float(np.ptp(np.quantile(mean, [0.01, 0.99], axis=0), axis=0).max())
-    if not tiles.gyro:
-        return Level(level, quietest, extent, np.inf, np.zeros(3))
-    return Level(level, quietest, extent, *_turning(sample, variance <= ACCELEROMETER_QUIET * quietest))
-
-
-def _turning(sample: Sequence[Windows], calm: NDArray[np.bool_]) -> tuple[float, Float]:
-    """Return the level of the gyroscope and its bias, from the windows that the accelerometer calls calm."""
-    rate = np.concatenate([w.rate for w in sample])[calm]
-    bias: Float = np.median(rate, axis=0)
-    square = np.concatenate([w.turning(bias) for w in sample])[calm]
-    return float(np.quantile(square, MOST_TURNING)), bias
-
-
-def _still_period(tiles: Tiles, rows: Rows, quietest: float, name: str) -> float:
-    """Return the norm of the variances over the stated still period at the beginning."""
-    still = rows.still or 0
-    wanted = still // tiles.size
-    if still > tiles.rows:
-        raise DataError(
-            f"{name}: has {tiles.rows:,} rows, fewer than the still period of {still:,} (--still)"
-        )
-    parts, have = [], 0
-    for first, block in tiles.blocks():
-        if first >= wanted:
-            break
-        parts.append(block[: wanted - first, :6])
-        have += len(parts[-1])
-    block = np.concatenate(parts)
-    mean = block[:, :3].mean(axis=0)
-    square = block[:, 3:6].sum(axis=0) + tiles.size * ((block[:, :3] - mean) ** 2).sum(axis=0)
-    level = float(np.linalg.norm(square / (have * tiles.size)))
-    if not 0 < level <= NOT_STILL * quietest:
-        raise DataError(
-            f"{name}: the first {still:,} rows are not still: variance {level:.4g}, {level / quietest:.3g} times "
-            f"that of the quietest windows ({quietest:.4g}); state a shorter --still, or leave it out"
-        )
-    return level
-
-
-def runs(
-    tiles: Tiles, rows: Rows, level: Level, multipliers: Sequence[float]
-) -> tuple[list[Ints], list[Ints]]:
-    """Return for every multiplier the first and the last window (each (I,)) of every run of still windows."""
-    starts: list[list[Ints]] = [[] for _ in multipliers]
-    ends: list[list[Ints]] = [[] for _ in multipliers]
-    still_before = np.zeros(len(multipliers), dtype=bool)
-    for block in windows(tiles, rows.width):
-        turning = block.turning(level.bias)
-        whole = ~block.broken  # nobody knows what happened in a gap
-        for k, multiplier in enumerate(multipliers):
-            calm = (block.variance <= multiplier * level.variance) & (turning <= multiplier * level.turning)
-            still = whole & calm
-            change = np.flatnonzero(np.diff(still, prepend=still_before[k])) + block.first
-            starts[k].append(change[int(still_before[k]) :: 2])
-            ends[k].append(change[1 - int(still_before[k]) :: 2] - 1)
-            still_before[k] = still[-1]
-    last = tiles.count - rows.width
-    for k, still_at_the_end in enumerate(still_before):
-        if still_at_the_end:
-            ends[k].append(np.array([last]))
-    return [np.concatenate(s) for s in starts], [np.concatenate(e) for e in ends]

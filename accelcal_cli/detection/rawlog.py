@@ -1,11 +1,7 @@
-"""A raw log: three accelerometer columns at a fixed rate, with time and three gyroscope columns where they exist.
+"""A raw log: acceleration at a fixed rate, with time and turning rate where there are such columns.
 
-What the time column of a raw log says: its unit, the rate, and dates as seconds.
-
-Gaps in the time column of a raw log: what is before and after one is not the same rest.
-
-They are told from the first and the last time of each tile, which are kept anyway: only the rows of a tile that
-lasts too long are looked at.
+`RawLog` reads a table once, from top to bottom. Its first rows show what the time column is: time of some unit and rate
+(`Clock`), dates, a row number, or no time at all.
 """
 
 from __future__ import annotations
@@ -14,6 +10,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -23,125 +20,23 @@ from numpy.typing import NDArray
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import RawColumns, choose_raw
-from accelcal_cli.io.reader import Table, open_table
-from accelcal_cli.io.text import Rows, shorten
+from accelcal_cli.io.reader import RowBlock, Table, open_table, shorten
 
 PROBE = 1000
-"""Rows that tell the step of the time column, and whether a column without a name is one."""
+"""Rows that determine the step of the time column, and whether a column without a name is time."""
 
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of a time column, in seconds."""
 
-@dataclass(frozen=True)
-class RawRows:
-    """A block of rows of a raw log.
+SLOWEST = 1.0
+"""Hz: no raw log is slower, so the time of one that seems slower is in a smaller unit."""
 
-    Attributes:
-        numbers: acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, shape (B, k).
-        gyro, timed: which of them there are.
-    """
-
-    numbers: Float
-    gyro: bool = False
-    timed: bool = False
-
-    @property
-    def time(self) -> Float | None:
-        """Time of each row, shape (B,), as given."""
-        return self.numbers[:, -1] if self.timed else None
-
-
-class RawLog:
-    """A raw log that is read once, from top to bottom."""
-
-    def __init__(self, table: Table, columns: RawColumns) -> None:
-        """Read the first rows of `table`: they tell what the time column is."""
-        self.name = table.name
-        self.columns = columns
-        self._table = table
-        self._rows = table.blocks(columns.selection())
-        if columns.dated:
-            self._rows = dated(self._rows, self._time_at)
-        self._head = _first(self._rows, PROBE)
-        self.clock = Clock()
-        self.notes = list(columns.notes)
-        self._settle_time()
-
-    def _settle_time(self) -> None:
-        """Take the time column for what it is: time, a row number, or no time at all."""
-        columns, times = self.columns, _column(self._head, -1)[:PROBE]
-        if columns.time is None:
-            return
-        steps = np.diff(times)
-        if columns.guessed and not (len(steps) and (steps >= 0).all() and (steps > 0).any()):
-            if columns.doubtful:
-                raise DataError(columns.doubtful)
-            self.columns = replace(columns, time=None)
-            return
-        self.clock = Clock.of(times, self._unit())
-        if columns.dated:
-            self.notes.append("time is counted in seconds from the first row")
-        if columns.guessed:
-            self.notes.append(f"column {columns.time + 1} taken as time: it never decreases")
-        if self.clock.rate is None:
-            self.columns = replace(columns, time=None)
-            self.notes.append(f"column {columns.time + 1} counts rows, it is no time")
-        elif self.clock.unit != "s":
-            self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows a second")
-
-    def _unit(self) -> str | None:
-        """Unit of the time column, where it is known before its steps are."""
-        if self.columns.dated:
-            return "s"
-        names, time = self._table.names, self.columns.time
-        return None if names is None or time is None else unit_of(names[time])
-
-    def _time_at(self, row: int) -> str:
-        """How to name the time of a row (from 0) that has been read."""
-        names, time = self._table.names, self.columns.time or 0
-        column = str(time + 1) if names is None else f'"{names[time]}"'
-        return f"{self.name}, {self.where(row)}, column {column}"
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the input, once all blocks have been read."""
-        return self._table.sha256
-
-    @property
-    def where(self) -> Callable[[int], str]:
-        """How to name a row (from 0) that has been read."""
-        return self._table.where
-
-    def blocks(self) -> Iterator[RawRows]:
-        """Yield the rows, block after block, in constant memory; time that goes back is a DataError."""
-        last = -np.inf
-        while self._head:
-            rows = self._head.pop(0)
-            raw = self._part(rows.numbers)
-            if raw.time is not None and len(raw.time):
-                self._check_time(raw.time, last, rows.start)
-                last = float(raw.time[-1])
-            yield raw
-            if not self._head:
-                self._head.extend(_first(self._rows, 1))
-
-    def close(self) -> None:
-        """Release the file."""
-        self._table.close()
-
-    def _part(self, numbers: Float) -> RawRows:
-        sensors = 6 if self.columns.gyro else 3
-        timed = self.columns.time is not None
-        return RawRows(numbers[:, : sensors + timed], sensors == 6, timed)
-
-    def _check_time(self, time: Float, last: float, start: int) -> None:
-        back = np.diff(time, prepend=last) < 0
-        if not back.any():
-            return
-        row = int(np.argmax(back))
-        before = time[row - 1] if row else last
-        raise DataError(
-            f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
-            "time that never decreases (--time none leaves it out)"
-        )
+_UNIT = re.compile(
+    r"(?:.*[\W_])?(?:(s|secs?|seconds?)|(ms|msecs?|millis|milliseconds?)|([uµμ]s|[uµμ]secs?|micros|microseconds?)"
+    r"|(ns|nsecs?|nanos|nanoseconds?))[\W_]*",
+    re.IGNORECASE,
+)
+_ZONE = re.compile(r"(?:[zZ]|[+-]\d\d(?::?\d\d)?)$")
 
 
 def open_raw_log(
@@ -169,41 +64,99 @@ def open_raw_log(
         raise
 
 
-def _first(rows: Iterator[Rows], least: int) -> list[Rows]:
-    """Take blocks until they hold `least` rows, or all there are."""
-    taken: list[Rows] = []
-    while sum(len(block.numbers) for block in taken) < least:
-        block = next(rows, None)
-        if block is None:
-            break
-        taken.append(block)
-    return taken
+class RawLog:
+    """A raw log that is read once, from top to bottom."""
 
+    def __init__(self, table: Table, columns: RawColumns) -> None:
+        """Read the first rows of `table` to find out what the time column is."""
+        self.name = table.name
+        self.columns = columns
+        self._table = table
+        self._rows = table.blocks(columns.selection())
+        if columns.dated:
+            self._rows = seconds_of_dates(self._rows, self._time_at)
+        self._head = _first(self._rows, PROBE)
+        self.clock = Clock()
+        self.notes = list(columns.notes)
+        self._settle_time()
 
-def _column(blocks: list[Rows], k: int) -> Float:
-    return np.concatenate([np.empty(0), *(block.numbers[:, k] for block in blocks)])
+    def _settle_time(self) -> None:
+        """Take the time column for what it is: time, a row number, or no time at all."""
+        columns = self.columns
+        if columns.time is None:
+            return
+        times = np.concatenate([np.empty(0), *(rows.numbers[:, -1] for rows in self._head)])[:PROBE]
+        steps = np.diff(times)
+        if columns.guessed and not (len(steps) and (steps >= 0).all() and (steps > 0).any()):
+            if columns.doubtful:
+                raise DataError(columns.doubtful)
+            self.columns = replace(columns, time=None)
+            return
+        names = self._table.names
+        unit = None if names is None else unit_of(names[columns.time])
+        self.clock = Clock.of(times, "s" if columns.dated else unit)
+        if columns.dated:
+            self.notes.append("time is counted in seconds from the first row")
+        if columns.guessed:
+            self.notes.append(f"column {columns.time + 1} taken as time: it never decreases")
+        if self.clock.rate is None:
+            self.columns = replace(columns, time=None)
+            self.notes.append(f"column {columns.time + 1} counts rows, so it is not time")
+        elif self.clock.unit != "s":
+            self.notes.append(f"time taken as {self.clock.unit}: {self.clock.rate:.6g} rows per second")
 
+    def _time_at(self, row: int) -> str:
+        """Return how to name the time of a row (from 0) that has been read."""
+        names, time = self._table.names, self.columns.time or 0
+        column = str(time + 1) if names is None else f'"{names[time]}"'
+        return f"{self.name}, {self.where(row)}, column {column}"
 
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Units of a time column, in seconds."""
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the input, once all blocks have been read."""
+        return self._table.sha256
 
-SLOWEST = 1.0
-"""Hz: no raw log is slower, so a slower one is taken as being in a smaller unit of time."""
+    @property
+    def where(self) -> Callable[[int], str]:
+        """How to name a row (from 0) that has been read."""
+        return self._table.where
 
-_UNIT = re.compile(
-    r"(?:.*[\W_])?(?:(s|secs?|seconds?)|(ms|msecs?|millis|milliseconds?)|([uµμ]s|[uµμ]secs?|micros|microseconds?)"
-    r"|(ns|nsecs?|nanos|nanoseconds?))[\W_]*",
-    re.IGNORECASE,
-)
-_ZONE = re.compile(r"(?:[zZ]|[+-]\d\d(?::?\d\d)?)$")
+    def blocks(self) -> Iterator[Float]:
+        """Yield the rows, block after block, in constant memory; time that goes back is a DataError.
+
+        Shape (B, k): acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, as given.
+        """
+        timed = self.columns.time is not None
+        width, last = (6 if self.columns.gyro else 3) + timed, -np.inf
+        for rows in chain(self._head, self._rows):
+            numbers = rows.numbers[:, :width]
+            if timed and len(numbers):
+                self._check_time(numbers[:, -1], last, rows.start)
+                last = float(numbers[-1, -1])
+            yield numbers
+
+    def close(self) -> None:
+        """Release the file."""
+        self._table.close()
+
+    def _check_time(self, time: Float, last: float, start: int) -> None:
+        back = np.diff(time, prepend=last) < 0
+        if not back.any():
+            return
+        row = int(np.argmax(back))
+        before = time[row - 1] if row else last
+        raise DataError(
+            f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
+            "time that never decreases (--time none leaves it out)"
+        )
 
 
 @dataclass(frozen=True)
 class Clock:
-    """What the time column says.
+    """Rate and unit of the time column.
 
     Attributes:
-        rate: rows a second, Hz; None where nothing says it.
+        rate: rows per second, Hz; None where it is unknown.
         unit: of the time column: s, ms, us or ns.
     """
 
@@ -212,15 +165,15 @@ class Clock:
 
     @property
     def period(self) -> float | None:
-        """From row to row, in the unit of the time column; None where nothing says it."""
+        """Time from row to row, in the unit of the time column; None where the rate is unknown."""
         return None if self.rate is None else 1.0 / (self.rate * UNITS[self.unit])
 
     @classmethod
     def of(cls, time: Float, unit: str | None = None) -> Self:
-        """Tell the rate from the first rows, shape (n,), and the unit where it is not stated.
+        """Return rate and unit, where it is not stated, from the times of the first rows, shape (n,).
 
-        Without a unit a step of exactly 1 counts rows and says nothing of time. A stated unit that makes the log
-        slower than any is not believed.
+        Without a unit a step of exactly 1 counts rows and gives no rate. A stated unit that would make the log
+        slower than SLOWEST is ignored.
         """
         steps = np.diff(time)
         steps = steps[steps > 0]
@@ -234,12 +187,12 @@ class Clock:
 
 def unit_of(name: str) -> str | None:
     """Return the unit that the name of a time column ends in, as in ``timestamp_ms`` or ``time [us]``."""
-    found = _UNIT.fullmatch(name.strip())
-    return None if found is None else list(UNITS)[next(k for k, part in enumerate(found.groups()) if part)]
+    match = _UNIT.fullmatch(name.strip())
+    return None if match is None else list(UNITS)[next(k for k, part in enumerate(match.groups()) if part)]
 
 
-def dated(rows: Iterable[Rows], place: Callable[[int], str]) -> Iterator[Rows]:
-    """Yield rows whose text is a date and a time with the seconds since the first row as one more column.
+def seconds_of_dates(rows: Iterable[RowBlock], place: Callable[[int], str]) -> Iterator[RowBlock]:
+    """Yield rows whose text is date and time with the seconds since the first row as one more column.
 
     Args:
         rows: blocks with text; place: how to name a row (from 0) and its column.
@@ -253,7 +206,7 @@ def dated(rows: Iterable[Rows], place: Callable[[int], str]) -> Iterator[Rows]:
         stamps = _stamps([cell.removesuffix(zone) for cell in text], block.start, text, place)
         first = first if len(first) else stamps[:1]
         seconds = (stamps - first).astype(np.int64) / 1e9
-        yield Rows(block.start, np.column_stack([block.numbers, seconds]))
+        yield RowBlock(block.start, np.column_stack([block.numbers, seconds]))
 
 
 def _stamps(
@@ -267,14 +220,14 @@ def _stamps(
             pass
     wrong = next(k for k, cell in enumerate(cells) if not _is_stamp(cell))
     raise DataError(
-        f"{place(start + wrong)}: {shorten(shown[wrong])} is no time; expected numbers, or dates as "
+        f"{place(start + wrong)}: {shorten(shown[wrong])} is not a time; expected numbers, or dates as "
         "2026-03-01T12:30:00.25, all in one time zone (--time none leaves it out)"
     )
 
 
 def _read(cells: list[str]) -> NDArray[np.datetime64]:
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # of a time zone, which numpy would drop
+        warnings.simplefilter("error")  # about a time zone, which numpy would drop
         return np.array(cells, dtype="datetime64[ns]")
 
 
@@ -283,3 +236,11 @@ def _is_stamp(cell: str) -> bool:
         return cell[:4].isdigit() and not np.isnat(_read([cell])[0])
     except (ValueError, UserWarning):
         return False
+
+
+def _first(rows: Iterator[RowBlock], least: int) -> list[RowBlock]:
+    """Take blocks until they hold `least` rows, or all there are."""
+    head: list[RowBlock] = []
+    while sum(len(block.numbers) for block in head) < least and (block := next(rows, None)):
+        head.append(block)
+    return head

@@ -1,34 +1,28 @@
-"""What all formats share: where the numbers come from, their units, and what a format drops."""
+"""What every exporter is, and what all formats share: the origin of the numbers, their units, and what a format drops.
+
+A format is one file: a frozen dataclass derived from `Exporter` and entered in `EXPORTERS`. Help, completion, the
+documentation and the contract tests follow from the class.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
+from accelcal_cli.registry import Registry
+from accelcal_cli.schema import check, setting
 from accelcal_cli.sensor.model import MRAD, STANDARD_GRAVITY, ErrorModel
 from accelcal_cli.sensor.poses import AXES
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """What is to be written for.
-
-    Attributes:
-        instance: number of the sensor in the target, from 0.
-        driver_scale: output units that the target's driver takes for 1 m/s^2; None when the readings of the result
-            are what the target sees.
-    """
-
-    instance: int = 0
-    driver_scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -39,11 +33,114 @@ class Export:
     warnings: tuple[str, ...] = ()
 
 
-Exporter = Callable[[Calibration, Target], Export]
+@dataclass(frozen=True)
+class Exporter(ABC):
+    """Base of all exporters; the fields of a subclass are the options of `accelcal export` that it takes.
+
+    Fields are made with `schema.setting`, which holds their help and range. An option that several formats take has
+    one name, one type and one help text in all of them. The first line of the docstring is the one-line help.
+    """
+
+    name: ClassVar[str]
+    suffix: ClassVar[str]
+    """Usual ending of a file of this format."""
+    binary: ClassVar[bool] = False
+    """Whether the content is no text, so that it cannot go to a terminal."""
+
+    def __post_init__(self) -> None:
+        """Refuse an option outside its range."""
+        check(self)
+
+    def export(self, result: Calibration) -> Export:
+        """Return a result in this format; whether its verdict allows that is the caller's concern.
+
+        Raises:
+            UsageError: the format cannot hold this result.
+        """
+        return Export(self.content(result), self.warnings(result))
+
+    @abstractmethod
+    def content(self, result: Calibration) -> bytes:
+        """Return the file, which names its `origin`.
+
+        Raises:
+            UsageError: the format cannot hold this result.
+        """
+
+    def warnings(self, result: Calibration) -> tuple[str, ...]:
+        """Return what the file leaves out, a sentence each: here the temperature slopes, which no format holds."""
+        if result.temperature is None:
+            return ()
+        return (
+            f"temperature slopes are dropped: the numbers hold at {result.temperature.reference:.4g} degrees",
+        )
+
+
+EXPORTERS: Registry[Exporter] = Registry(
+    Exporter, "accelcal_cli.exporters", "export format", "accelcal.exporters"
+)
+
+INSTANCE = "number of the accelerometer in the target, from 0"
+
+
+@dataclass(frozen=True)
+class DriverExporter(Exporter):
+    """Base of the formats of targets that correct what a driver makes of the sensor's output, in m/s^2."""
+
+    instance: int = setting(0, INSTANCE, low=0)
+    driver_scale: float | None = setting(
+        None, "output units that the target's driver takes for 1 m/s^2", above=0
+    )
+
+    def in_metres(self, result: Calibration) -> ErrorModel:
+        """Return the error model of readings that are in m/s^2 before they are corrected.
+
+        Readings in g are multiplied by 9.80665 on both sides; others by what the driver makes of them.
+
+        Raises:
+            UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver
+                scale that is not that of these readings.
+        """
+        metres = metres_per_unit(result)
+        scale = np.diagonal(result.K_a) / metres
+        if self.driver_scale is not None:
+            near = scale / self.driver_scale
+            if not (NEAR_ONE[0] < near.min() and near.max() < NEAR_ONE[1]):
+                raise UsageError(
+                    f"--driver-scale {self.driver_scale:g}: the calibrated readings are {scale.mean():.6g} per m/s^2; "
+                    f"expected a number within a factor of {NEAR_ONE[1]:g} of that"
+                )
+            return ErrorModel(result.K_a / metres / self.driver_scale, result.D_a / self.driver_scale)
+        if not is_force(result):
+            raise UsageError(
+                f"--to {self.name} needs readings in m/s^2, and these are in output units, {scale.mean():.6g} per "
+                f"m/s^2; state with --driver-scale how many the driver takes for 1 m/s^2"
+            )
+        return ErrorModel(result.K_a, result.D_a * metres)
+
+
+@dataclass(frozen=True)
+class DiagonalExporter(DriverExporter):
+    """Base of the formats of targets that correct axis by axis and know no misalignments."""
+
+    def warnings(self, result: Calibration) -> tuple[str, ...]:
+        """Return the misalignments that are left out, in mrad and as force at 1 g, and what all formats leave out."""
+        further = super().warnings(result)
+        if result.held.any():
+            return further
+        rest = result.K_a / np.diagonal(result.K_a)[:, None] - np.eye(3)
+        i, j = np.unravel_index(int(np.abs(rest).argmax()), (3, 3))
+        angle = abs(float(rest[i, j]))
+        error = result.g * metres_per_unit(result) * float(np.linalg.norm(rest, 2))
+        return (
+            f"this format has no misalignments: up to {angle * MRAD:.3g} mrad ({angle:.3f} rad, axis {AXES[i]} towards "
+            f"{AXES[j]}) are dropped, an error of up to {error:.2g} m/s^2 at 1 g",
+            *further,
+        )
 
 
 def origin(result: Calibration) -> list[str]:
-    """Return lines that say where the numbers come from."""
+    """Return lines that say where the numbers come from; every file holds them."""
     lines = [
         f"accelcal {result.version}, verdict {result.verdict}, {result.poses} poses, g = {result.g:.9g} {result.unit}, "
         f"gauge {result.gauge}",
@@ -63,59 +160,12 @@ def rows(matrix: Float) -> list[list[float]]:
     return [[float(v) for v in row] for row in np.atleast_2d(matrix)]
 
 
-def force_already(result: Calibration) -> bool:
-    """Whether the readings are specific force already, in the unit of the result."""
+def is_force(result: Calibration) -> bool:
+    """Return whether the readings are specific force already, in the unit of the result."""
     scale = np.diagonal(result.K_a)
     return bool(NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1])
 
 
-def in_metres(result: Calibration, target: Target, name: str) -> ErrorModel:
-    """Return the sensor for a target whose readings are in m/s^2 before they are corrected.
-
-    Readings in g are multiplied by 9.80665 on both sides; others by what the driver makes of them.
-
-    Raises:
-        UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver scale
-            that is not that of these readings.
-    """
-    metres = STANDARD_GRAVITY if result.unit == "g" else 1.0  # how much one unit of f is in m/s^2
-    scale = np.diagonal(result.K_a) / metres
-    if target.driver_scale is not None:
-        near = scale / target.driver_scale
-        if not (NEAR_ONE[0] < near.min() and near.max() < NEAR_ONE[1]):
-            raise UsageError(
-                f"--driver-scale {target.driver_scale:g}: the calibrated readings are {scale.mean():.6g} to 1 m/s^2; "
-                f"expected a number within a factor of {NEAR_ONE[1]:g} of it"
-            )
-        return ErrorModel(result.K_a / metres / target.driver_scale, result.D_a / target.driver_scale)
-    if not force_already(result):
-        raise UsageError(
-            f"--to {name}: corrects readings in m/s^2, and these are in output units, {scale.mean():.6g} of them to "
-            f"1 m/s^2; state with --driver-scale how many the driver takes for 1 m/s^2"
-        )
-    return ErrorModel(result.K_a, result.D_a * metres)
-
-
-def dropped(model: ErrorModel, result: Calibration) -> tuple[str, ...]:
-    """Return a sentence on the misalignments that a diagonal format leaves out, in mrad and as force at 1 g, if any."""
-    if result.held.any():
-        return ()
-    rest = model.K / np.diagonal(model.K)[:, None] - np.eye(3)
-    i, j = np.unravel_index(int(np.abs(rest).argmax()), (3, 3))
-    angle = abs(float(rest[i, j]))
-    metres = result.g * (STANDARD_GRAVITY if result.unit == "g" else 1.0)
-    error = metres * float(np.linalg.norm(rest, 2))
-    return (
-        f"this format has no misalignments: up to {angle * MRAD:.3g} mrad ({angle:.3f} rad, axis {AXES[i]} towards "
-        f"{AXES[j]}) are dropped, an error of up to {error:.2g} m/s^2 at 1 g",
-    )
-
-
-def without_temperature(result: Calibration) -> tuple[str, ...]:
-    """Return a warning when the result has temperature slopes, which no format here holds."""
-    temperature = getattr(result, "temperature", None)
-    if temperature is None:
-        return ()
-    return (
-        f"the slopes with temperature are dropped: the numbers hold at {temperature.reference:.4g} degrees",
-    )
+def metres_per_unit(result: Calibration) -> float:
+    """Return how many m/s^2 one unit of the calibrated force is: 9.80665 for g, else 1."""
+    return STANDARD_GRAVITY if result.unit == "g" else 1.0

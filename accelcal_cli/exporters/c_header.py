@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import Export, Target
+from accelcal_cli.exporters.base import EXPORTERS, Exporter
 
 HEADER = """\
 #ifndef ACCELCAL_CALIBRATION_H
 #define ACCELCAL_CALIBRATION_H
 
 /*
-{said} */
+{origin} */
 
 #define ACCELCAL_UNIT "{unit}" /* of the force */
 
@@ -32,18 +35,27 @@ static inline void accelcal_apply(const double reading[3], double force[3]) {{
 """
 
 
-def export(result: Calibration, target: Target) -> Export:  # noqa: ARG001  # one signature for all
-    """Return accelcal_K_A, accelcal_f_0 and accelcal_apply: f = K_A N - f_0, in the unit of the result."""
-    said = [line.replace("*/", "* /") for line in base.origin(result)]
-    matrix = "".join(f"    {{{_numbers(row)}}},\n" for row in base.rows(result.model.K_A))
-    text = HEADER.format(
-        said=base.comment(said, " *"),
-        unit=result.unit,
-        matrix=matrix,
-        bias=_numbers(base.rows(result.model.f_0)[0]),
-    )
-    return Export(text.encode(), base.without_temperature(result))
+@EXPORTERS.register("c-header")
+@dataclass(frozen=True)
+class CHeader(Exporter):
+    """C or C++ header with constants and a function that corrects a reading.
+
+    accelcal_K_A, accelcal_f_0 and accelcal_apply: f = K_A N - f_0, in the unit of the result.
+    """
+
+    suffix = ".h"
+
+    def content(self, result: Calibration) -> bytes:
+        """Return the header; a `*/` in the origin does not end its comment."""
+        lines = [line.replace("*/", "* /") for line in base.origin(result)]
+        text = HEADER.format(
+            origin=base.comment(lines, " *"),
+            unit=result.unit,
+            matrix="".join(f"    {{{_numbers(row)}}},\n" for row in result.model.K_A),
+            bias=_numbers(result.model.f_0),
+        )
+        return text.encode()
 
 
-def _numbers(row: list[float]) -> str:
-    return ", ".join(repr(value) for value in row)
+def _numbers(row: Float) -> str:
+    return ", ".join(repr(float(value)) for value in row)

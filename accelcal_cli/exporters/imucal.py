@@ -1,44 +1,57 @@
-"""The calibration info of imucal, JSON.
+"""imucal corrects a reading as R_a^-1 K_a^-1 (acc - b_a) (FerrarisCalibrationInfo).
 
-imucal corrects a reading as R_a^-1 K_a^-1 (acc - b_a) (FerrarisCalibrationInfo): its K_a holds the scale factors alone,
-R_a the rest. The gyroscope is left as it is.
+Its K_a holds the scale factors alone, R_a the rest. The gyroscope is left as it is.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 
 import numpy as np
 
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import Export, Target
+from accelcal_cli.exporters.base import EXPORTERS, Exporter
 
 FORMAT = "2.0.0"
 
 
-def export(result: Calibration, target: Target) -> Export:  # noqa: ARG001  # one signature for all
-    """Return a Ferraris calibration: K_a diagonal, R_a = K_a^-1 times the whole matrix, b_a the bias.
+@EXPORTERS.register("imucal")
+@dataclass(frozen=True)
+class Imucal(Exporter):
+    """Calibration info of the Python package imucal.
 
-    In gauge `full` the axes may lie anywhere in the body, and the length of a row is the scale factor.
+    A Ferraris calibration: K_a diagonal, R_a = K_a^-1 times the whole matrix, b_a the bias. In gauge `full` the axes
+    may lie anywhere in the body, and the length of a row is the scale factor.
     """
-    scale = np.linalg.norm(result.K_a, axis=1) if result.gauge == "full" else np.diagonal(result.K_a)
-    record = {
-        "cal_type": "Ferraris",
-        "_format_version": FORMAT,
-        "acc_unit": result.unit,
-        "gyr_unit": "deg/s",
-        "from_acc_unit": result.unit if base.force_already(result) else "a.u.",
-        "from_gyr_unit": "deg/s",
-        "comment": "; ".join([*base.origin(result), "gyroscope not calibrated: identity"]),
-        "K_a": base.rows(np.diag(scale)),
-        "R_a": base.rows(result.K_a / scale[:, None]),
-        "b_a": base.rows(result.D_a)[0],
-        "K_g": base.rows(np.eye(3)),
-        "R_g": base.rows(np.eye(3)),
-        "K_ga": base.rows(np.zeros((3, 3))),
-        "b_g": [0.0, 0.0, 0.0],
-    }
-    text = json.dumps(record, indent=4) + "\n"
-    warning = "the gyroscope part is the identity: accelcal calibrates accelerometers"
-    return Export(text.encode(), (warning, *base.without_temperature(result)))
+
+    suffix = ".json"
+
+    def content(self, result: Calibration) -> bytes:
+        """Return the record as JSON."""
+        scale = np.linalg.norm(result.K_a, axis=1) if result.gauge == "full" else np.diagonal(result.K_a)
+        record = {
+            "cal_type": "Ferraris",
+            "_format_version": FORMAT,
+            "acc_unit": result.unit,
+            "gyr_unit": "deg/s",
+            "from_acc_unit": result.unit if base.is_force(result) else "a.u.",
+            "from_gyr_unit": "deg/s",
+            "comment": "; ".join([*base.origin(result), "gyroscope not calibrated: identity"]),
+            "K_a": base.rows(np.diag(scale)),
+            "R_a": base.rows(result.K_a / scale[:, None]),
+            "b_a": base.rows(result.D_a)[0],
+            "K_g": base.rows(np.eye(3)),
+            "R_g": base.rows(np.eye(3)),
+            "K_ga": base.rows(np.zeros((3, 3))),
+            "b_g": [0.0, 0.0, 0.0],
+        }
+        return (json.dumps(record, indent=4) + "\n").encode()
+
+    def warnings(self, result: Calibration) -> tuple[str, ...]:
+        """Return what is left out, and that the gyroscope is not calibrated."""
+        return (
+            "the gyroscope part is the identity: accelcal calibrates accelerometers",
+            *super().warnings(result),
+        )

@@ -1,15 +1,16 @@
-"""The IMU file of Kalibr, model scale-misalignment.
+"""Kalibr's model of a reading is M a + b with a lower triangular M.
 
-Kalibr's model of a reading is M a + b with a lower triangular M (kalibr_imu_camera_calibration,
-IccScaledMisalignedImu):
-M is K_a in gauge `lower`, b is D_a. Kalibr itself estimates b anew in every run; the key is for other readers.
+It is that of kalibr_imu_camera_calibration, IccScaledMisalignedImu. M is K_a in gauge `lower`, b is D_a. Kalibr itself
+estimates b anew in every run; the key is for other readers.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import Export, Target
+from accelcal_cli.exporters.base import EXPORTERS, DriverExporter
 
 UNKNOWN = """\
   # PLACEHOLDERS: a static calibration does not know them. Take them from the data sheet or an Allan deviation.
@@ -22,20 +23,33 @@ UNKNOWN = """\
 """
 
 
-def export(result: Calibration, target: Target) -> Export:
-    """Return imuN with accelerometers.M and .b; noise, rate and topic are marked placeholders."""
-    if target.driver_scale is not None or base.force_already(result):
-        model, unit = base.in_metres(result, target, "kalibr").in_gauge("lower"), "m/s^2"
-    else:
-        model, unit = result.model.in_gauge("lower"), "unit of the readings"
-    said = [
-        *base.origin(result),
-        f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular (gauge lower).",
-    ]
-    matrix = "".join(f"    - {row}\n" for row in base.rows(model.K))
-    text = (
-        f"{base.comment(said)}imu{target.instance}:\n  model: scale-misalignment\n  accelerometers:\n    M:\n{matrix}"
-        f"    b: {base.rows(model.D)[0]}\n{UNKNOWN}"
-    )
-    warning = "noise densities, random walks, rate and topic are placeholders: fill them in"
-    return Export(text.encode(), (warning, *base.without_temperature(result)))
+@EXPORTERS.register("kalibr")
+@dataclass(frozen=True)
+class Kalibr(DriverExporter):
+    """IMU file of Kalibr, model scale-misalignment."""
+
+    suffix = ".yaml"
+
+    def content(self, result: Calibration) -> bytes:
+        """Return imuN with accelerometers.M and .b; noise, rate and topic are marked placeholders."""
+        if self.driver_scale is not None or base.is_force(result):
+            model, unit = self.in_metres(result).in_gauge("lower"), "m/s^2"
+        else:
+            model, unit = result.model.in_gauge("lower"), "unit of the readings"
+        header = [
+            *base.origin(result),
+            f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular (gauge lower).",
+        ]
+        matrix = "".join(f"    - {row}\n" for row in base.rows(model.K))
+        text = (
+            f"{base.comment(header)}imu{self.instance}:\n  model: scale-misalignment\n  accelerometers:\n    M:\n"
+            f"{matrix}    b: {base.rows(model.D)[0]}\n{UNKNOWN}"
+        )
+        return text.encode()
+
+    def warnings(self, result: Calibration) -> tuple[str, ...]:
+        """Return what is left out, and that there are placeholders."""
+        return (
+            "noise densities, random walks, rate and topic are placeholders: fill them in",
+            *super().warnings(result),
+        )

@@ -1,4 +1,7 @@
-"""How a text table is written: separator, decimal mark, header. Found from its first lines."""
+"""How a text table is written: separator, decimal mark, header; `sniff` finds it from the first lines.
+
+The parsers of text.py and the writer of rewrite.py share the reading of one line that is defined here.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,13 @@ from dataclasses import dataclass
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.stream import LONGEST_LINE
 
-SAMPLE = 1000  # content lines looked at
+SAMPLE = 1000
+"""Content lines that the dialect is found from."""
+
+BOM = b"\xef\xbb\xbf"
+
 _QUOTED = re.compile(r'"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
-BOM = b"\xef\xbb\xbf"
 
 
 @dataclass(frozen=True)
@@ -31,13 +37,9 @@ class Dialect:
         """Cells a row must have."""
         return len(self.first if self.names is None else self.names)
 
-    def split(self, line: str) -> list[str]:
-        """Cells of one line, stripped of blanks and quotes."""
-        return split_cells(line, self.separator)
-
 
 def split_cells(line: str, separator: str) -> list[str]:
-    """Cells of one line, stripped of blanks and quotes."""
+    """Return the cells of one line, stripped of blanks and quotes."""
     if '"' not in line:
         return line.split() if separator == " " else [cell.strip() for cell in line.split(separator)]
     if separator == " ":
@@ -50,7 +52,7 @@ def split_cells(line: str, separator: str) -> list[str]:
 
 
 def looks_numeric(cell: str, decimal_comma: bool = True) -> bool:
-    """Whether a cell is meant as a number, be it NaN or infinite."""
+    """Return whether a cell is meant as a number, be it NaN or infinite."""
     try:
         float(cell.replace(",", ".") if decimal_comma else cell)
     except ValueError:
@@ -59,10 +61,10 @@ def looks_numeric(cell: str, decimal_comma: bool = True) -> bool:
 
 
 def sniff(head: bytes, source: str) -> Dialect:
-    """Find the dialect of a table from its first bytes."""
+    """Find the dialect of a table from its first bytes; DataError, which names the `source`, for no text table."""
     lines, comment = _sample(head, source)
     if not lines:
-        raise DataError(f"{source}: is empty; readings were expected, one row a pose")
+        raise DataError(f"{source}: is empty; readings were expected, one row per pose")
     texts = [text for _, text in lines]
     separator = _separator(texts[1:] or texts)
     number, opening = lines[0]
@@ -81,30 +83,30 @@ def sniff(head: bytes, source: str) -> Dialect:
 
 
 def _sample(head: bytes, source: str) -> tuple[list[tuple[int, str]], str]:
-    """First content lines with their numbers, and the last comment line before them."""
-    found: list[tuple[int, str]] = []
+    """Return the first content lines with their numbers, and the last comment line before them."""
+    lines: list[tuple[int, str]] = []
     comment = ""
     for number, raw in enumerate(io.BytesIO(head.removeprefix(BOM)), 1):
-        text = decode_line(raw, number, source, strict=not found).strip("\r\n")
+        text = decode_line(raw, number, source, strict=not lines).strip("\r\n")
         if text.lstrip().startswith("#"):
-            comment = comment if found else text.lstrip()[1:]
+            comment = comment if lines else text.lstrip()[1:]
         elif not is_blank(text):
-            found.append((number, text))
-        if len(found) == SAMPLE:
+            lines.append((number, text))
+        if len(lines) == SAMPLE:
             break
-    if len(found) > 2 and not head.endswith(b"\n"):
-        found.pop()  # the head may end within a line
-    return found, comment
+    if len(lines) > 2 and not head.endswith(b"\n"):
+        lines.pop()  # the head may end within a line
+    return lines, comment
 
 
 def is_blank(line: str) -> bool:
-    """Whether a line has nothing but blanks and separators, or is the note `sep=;`: spreadsheets leave both."""
+    """Return whether a line is blanks and separators only, or the note `sep=;`: spreadsheets leave both."""
     rest = line.strip(" \t\r\n,;")
     return not rest or rest.lower() == "sep="
 
 
 def decode_line(raw: bytes, number: int, source: str, *, strict: bool = True) -> str:
-    """Text of one line; binary data, foreign encodings and endless lines are refused by line number."""
+    """Return the text of one line; DataError with its number for binary data, another encoding or an endless line."""
     if b"\0" in raw:
         raise DataError(f"{source}, line {number}: holds NUL bytes; this is binary data, not a text table")
     if len(raw) > LONGEST_LINE:
@@ -119,7 +121,7 @@ def decode_line(raw: bytes, number: int, source: str, *, strict: bool = True) ->
 
 
 def _separator(lines: list[str]) -> str:
-    """Separator of the data lines: the one under which the largest share of cells are numbers."""
+    """Return the separator of the data lines: the one under which the largest share of cells are numbers."""
     bare = [_QUOTED.sub("0", line.strip("\r\n")) for line in lines[:64]]
     best, share = " ", -1.0
     for separator in (";", "\t", ",", " "):
@@ -141,14 +143,14 @@ def _numeric_share(rows: list[list[str]], *, decimal_comma: bool) -> float:
 
 
 def _uneven(first: str, second: str, lines: list[str]) -> bool:
-    """Whether `first` leaves rows of different widths and `second` does not."""
+    """Return whether `first` leaves rows of different widths and `second` does not."""
     widths = [{len(split_cells(line.strip(), separator)) for line in lines} for separator in (first, second)]
     gaps = any("" in split_cells(line.strip(), first) for line in lines)
     return (len(widths[0]) > 1 or gaps) and len(widths[1]) == 1
 
 
 def _decimal_comma(lines: list[str], separator: str) -> bool:
-    """Whether the first fraction among the data is written with a comma."""
+    """Return whether the first fraction among the data is written with a comma."""
     for line in lines:
         if "," not in line and "." not in line:
             continue
@@ -161,7 +163,7 @@ def _decimal_comma(lines: list[str], separator: str) -> bool:
 
 
 def _header_cells(line: str, separator: str) -> list[str]:
-    """Cells of a header; a unit in brackets belongs to the name before it, blank or not."""
+    """Return the cells of a header; a unit in brackets belongs to the name before it, blank or not."""
     if separator == " " and '"' not in line:
         return re.split(r"\s+(?![\[(])", line.strip())
     return split_cells(line, separator)
@@ -177,12 +179,12 @@ def _is_header(cells: list[str], second: list[str]) -> bool:
 
 
 def _without_tail(cells: list[str]) -> list[str]:
-    """Cells without the empty one that a separator at the end of the line makes."""
+    """Return the cells without the empty one that a separator at the end of the line makes."""
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
 
 
 def _names_of_comment(comment: str, separator: str, width: int) -> tuple[str, ...] | None:
-    """Names from a comment line above the data, if it has one word for each column."""
+    """Return the names in a comment line above the data, if it has one word for each column."""
     cells = _header_cells(comment, separator)
     fits = len(cells) == width > 1 and all(cells) and not any(looks_numeric(cell) for cell in cells)
     return tuple(cells) if fits else None

@@ -1,6 +1,7 @@
-"""Static readings of many sensors, handed out in batches whose arrays a computer likes.
+"""Static readings of many sensors, from one table with a column that labels the sensor, or from one file per sensor.
 
-Files of many sensors: one table with a column that labels the sensor, or one file a sensor.
+`read_fleet` gathers the rows into stores that may be on disk; `FleetReadings.batches` yields the sensors in batches of
+about equally many poses, as arrays that fit the caches of the processor.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,12 +16,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.io.columns import Columns, choose, sensor_column, sensor_columns
-from accelcal_cli.io.reader import Table, open_table
+from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_column
+from accelcal_cli.io.reader import RowBlock, Table, open_table
 from accelcal_cli.io.readings import LabelledMeans, Readings, check_rows
 from accelcal_cli.io.screening import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.io.stream import RowStore
-from accelcal_cli.io.text import Rows
 
 SLAB = 2_000_000
 """Poses that are in memory at once, unless one sensor has more."""
@@ -32,17 +31,22 @@ BATCH = 16_384
 STRETCH = 1.25
 """No sensor of a batch has more than so many times the poses of another."""
 
+MOST_POSES = 20_000_000
+"""Poses with a label of their own in one table, at most."""
+
+COLD = "Temperature column not used: calibrate fits slopes with temperature, one sensor at a time."
+
 
 @dataclass(frozen=True)
-class Origin:
-    """A table that was read.
+class TableOrigin:
+    """A table that poses were read from.
 
     Attributes:
         name: as given; sha256: of its bytes; columns: names of its output columns.
         first: number of its first pose among those of all tables.
         where: how to name one of its poses, counted from 0.
         notes: what the reader did that a user should know.
-        rows: whether each row is taken for a pose, not each label; timed: whether they have times.
+        rows: whether each row, not each label, is a pose; timed: whether the rows have times.
     """
 
     name: str
@@ -62,7 +66,7 @@ class Batch:
     Attributes:
         sensors: their numbers, shape (R,); count: poses of each, shape (R,).
         output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
-        behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table tells.
+        behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
         scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise.
     """
 
@@ -100,17 +104,13 @@ class FleetReadings:
     source: str
     sensors: tuple[str, ...]
     poses: Int
-    origins: tuple[Origin, ...]
+    origins: tuple[TableOrigin, ...]
     _store: RowStore = field(repr=False)  # number of the sensor, output
     _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
 
-    @cached_property
-    def _firsts(self) -> list[int]:
-        return [origin.first for origin in self.origins]
-
-    def origin(self, pose: int) -> Origin:
+    def origin(self, pose: int) -> TableOrigin:
         """Return the table that a pose came from, by its number among all."""
-        return self.origins[bisect.bisect_right(self._firsts, pose) - 1]
+        return self.origins[bisect.bisect_right(self.origins, pose, key=lambda origin: origin.first) - 1]
 
     def where(self, pose: int) -> str:
         """Return how to name a pose, by its number among all: ``line 8``."""
@@ -136,7 +136,7 @@ class FleetReadings:
         )
 
     def cautions(self, batch: Batch, at: int) -> tuple[str, ...]:
-        """Return why the readings of the sensor at `at` in a batch may be no poses, in sentences."""
+        """Return why the readings of the sensor at `at` in a batch may not be poses, in sentences."""
         origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
         first = output[:LOOKED_AT]
         log: tuple[str, ...] = ()
@@ -212,14 +212,8 @@ def _groups(counts: Int) -> Iterator[slice]:
 
 def _known(extra: Float | None, at: int, count: int) -> Float | None:
     """Return what is known of one sensor's poses; None where nothing is."""
-    found = None if extra is None else extra[at, :count]
-    return None if found is None or np.isnan(found).all() else found
-
-
-MOST_POSES = 20_000_000
-"""Poses with a label of their own in one table, at most."""
-
-COLD = "Temperature column not used: slopes with temperature go sensor by sensor, with calibrate."
+    known = None if extra is None else extra[at, :count]
+    return None if known is None or np.isnan(known).all() else known
 
 
 def read_fleet(
@@ -237,25 +231,25 @@ def read_fleet(
     Raises:
         DataError: a fault of the input, with its place; UsageError: of `columns` or `sensor`, or a file twice.
     """
-    again = next((source for k, source in enumerate(sources) if source in sources[:k]), None)
-    if again is not None:
-        raise UsageError(f"{again}: is given twice")
+    for k, source in enumerate(sources):
+        if source in sources[:k]:
+            raise UsageError(f"{source}: is given twice")
     each = len(sources) > 1 and sensor is None
     names = _file_names(sources) if each else [None] * len(sources)
-    gathered = _Gathering()
+    collector = _FleetCollector()
     for source, name in zip(sources, names, strict=True):
         table = open_table(source, stdin)
         try:
-            gathered.read(table, columns, sensor, name)
+            collector.read(table, columns, sensor, name)
         finally:
             table.close()
-    label = gathered.origins[0].name if len(sources) == 1 else f"{len(sources)} files"
-    if not each and gathered.store.rows == len(gathered.index) > 1:
+    label = collector.origins[0].name if len(sources) == 1 else f"{len(sources)} files"
+    if not each and collector.store.rows == len(collector.index) > 1:
         raise DataError(
             f"{label}: every row has another sensor; expected several poses of each (--sensor-column says which "
             "column labels the sensor)"
         )
-    return gathered.fleet(label)
+    return collector.fleet(label)
 
 
 def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
@@ -269,15 +263,15 @@ def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
     return names if len(set(names)) == len(names) else sources
 
 
-class _Gathering:
-    """What the tables so far hold."""
+class _FleetCollector:
+    """Gathers the rows of tables into poses of sensors."""
 
     def __init__(self) -> None:
         self.index: dict[str, int] = {}
         self.poses: Int = np.zeros(0, dtype=np.intp)
         self.store = RowStore(4)
         self.extras: RowStore | None = None
-        self.origins: list[Origin] = []
+        self.origins: list[TableOrigin] = []
 
     def fleet(self, source: str) -> FleetReadings:
         return FleetReadings(
@@ -287,7 +281,7 @@ class _Gathering:
     def read(self, table: Table, wanted: Sequence[str] | None, sensor: str | None, name: str | None) -> None:
         """Read one table: of the sensor `name`, or of many."""
         first = self.store.rows
-        column = sensor_column(table, sensor) if name is None else _own_column(table)
+        column = sensor_column(table, sensor) if name is None else own_sensor_column(table)
         columns = choose(table, wanted, column)
         if column in columns.output:
             shown = columns.names[columns.output.index(column)]
@@ -298,24 +292,21 @@ class _Gathering:
                 continue
             check_rows(table, columns, rows)
             codes = self._codes(rows.texts[0] if name is None else _only(table, columns, rows, name))
+            output, (count, scatter, _) = rows.numbers[:, :3], columns.split(rows.numbers[:, 3:])
             if means is None:
-                self._add(codes, rows.numbers[:, :3], *_extras(columns, rows))
+                self._add(codes, output, count, scatter)
             else:
-                keys = list(zip(codes.tolist(), rows.texts[-1], strict=True))
-                means.add(keys, rows.numbers[:, :3], *_extras(columns, rows))
-        where = table.where
+                means.add(list(zip(codes.tolist(), rows.texts[-1], strict=True)), output, count, scatter)
         if means is not None:
-            keys = list(means.index)
-            codes = np.array([code for code, _ in keys], dtype=np.intp)
+            codes = np.array([code for code, _ in means.index], dtype=np.intp)
             self._add(codes, means.mean, means.count(), means.scatter())
-            where = _by_label([label for _, label in keys])
         self.origins.append(
-            Origin(
+            TableOrigin(
                 table.name,
                 table.sha256,
                 columns.names,
                 first,
-                where,
+                table.where if means is None else _by_label([label for _, label in means.index]),
                 columns.notes if columns.temperature is None else (*columns.notes, COLD),
                 rows=means is None,
                 timed=columns.time is not None,
@@ -325,8 +316,7 @@ class _Gathering:
     def _codes(self, labels: Sequence[str]) -> Int:
         """Return the numbers of sensors, shape (B,), by their labels; a new one gets the next."""
         index = self.index
-        found = (index.setdefault(label, len(index)) for label in labels)
-        return np.fromiter(found, np.intp, len(labels))
+        return np.fromiter((index.setdefault(label, len(index)) for label in labels), np.intp, len(labels))
 
     def _add(self, codes: Int, output: Float, behind: Float | None, scatter: Float | None) -> None:
         """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""
@@ -339,37 +329,22 @@ class _Gathering:
         if self.extras is None:
             self.extras = RowStore(4)
             self.extras.append(np.full((before, 4), np.nan))
-        rows = np.full((len(codes), 4), np.nan)
-        if behind is not None:
-            rows[:, 0] = behind
-        if scatter is not None:
-            rows[:, 1:] = scatter
+        rows = np.empty((len(codes), 4))
+        rows[:, 0] = np.nan if behind is None else behind
+        rows[:, 1:] = np.nan if scatter is None else scatter
         self.extras.append(rows)
 
 
-def _own_column(table: Table) -> int | None:
-    """Return the column that labels the sensor in a table that should hold one only, if there is one."""
-    found, _ = sensor_columns(table)
-    return found[0] if len(found) == 1 else None
-
-
-def _only(table: Table, columns: Columns, rows: Rows, name: str) -> list[str]:
+def _only(table: Table, columns: Columns, rows: RowBlock, name: str) -> list[str]:
     """Return the name of a file's sensor for each row; more than one label in its sensor column is refused."""
     if columns.sensor is not None and len(set(rows.texts[0])) > 1:
         shown = (table.names or ())[columns.sensor]
         raise DataError(
-            f'{table.name}: column "{shown}" labels several sensors where one file a sensor was expected; '
-            f'state --sensor-column "{shown}" to read every file so'
+            f'{table.name}: column "{shown}" labels several sensors where one file per sensor was expected; '
+            f'state --sensor-column "{shown}" to read every file that way'
         )
     return [name] * len(rows.numbers)
 
 
 def _by_label(labels: list[str]) -> Callable[[int], str]:
     return lambda pose: f'position "{labels[pose]}"'
-
-
-def _extras(columns: Columns, rows: Rows) -> tuple[Float | None, Float | None]:
-    """Return count (B,) and standard deviation (B, 3) of the rows, where the table has them."""
-    at = 3 if columns.count is None else 4
-    count = None if columns.count is None else rows.numbers[:, 3]
-    return count, None if columns.scatter is None else rows.numbers[:, at : at + 3]

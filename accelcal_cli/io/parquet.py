@@ -1,7 +1,4 @@
-"""Tables in Parquet form.
-
-A Parquet log written anew, as Parquet or as text.
-"""
+"""Parquet tables, read with polars, and Parquet logs rewritten as Parquet or as text."""
 
 from __future__ import annotations
 
@@ -16,12 +13,12 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.reader import Table
+from accelcal_cli.io.reader import LIMIT, NO_LABEL, RowBlock, Selection, Table
 from accelcal_cli.io.rewrite import Change, system_errors
-from accelcal_cli.io.stream import Beside, ByteSource
-from accelcal_cli.io.text import LIMIT, NO_LABEL, Rows, Selection
+from accelcal_cli.io.stream import BackgroundThread, ByteSource
 
-ROWS = 500_000  # rows of a block
+ROWS = 500_000
+"""Rows of a block."""
 
 
 class ParquetTable:
@@ -30,10 +27,10 @@ class ParquetTable:
     has_rows: bool
 
     def __init__(self, source: ByteSource, path: Path | None) -> None:
-        """Look at the schema. Without a `path` (standard input) make a copy: Parquet starts at its end."""
+        """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
         self.name = source.name
         self._source = source
-        self._hashing = Beside()
+        self._hashing = BackgroundThread()
         self._files = ExitStack()
         try:
             self._path = path or self._copy()
@@ -55,29 +52,28 @@ class ParquetTable:
         self._hashing.wait()
         return self._source.sha256
 
-    def blocks(self, selection: Selection) -> Iterator[Rows]:
+    def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns."""
-        wanted = [self.names[k] for k in (*selection.numbers, *selection.texts)]
-        for _, rows in self._read(selection, sorted(set(wanted), key=wanted.index)):
-            yield rows
+        wanted = dict.fromkeys(self.names[k] for k in (*selection.numbers, *selection.texts))
+        return (rows for _, rows in self._read(selection, list(wanted)))
 
-    def pairs(self, selection: Selection) -> Iterator[tuple[pl.DataFrame, Rows]]:
+    def pairs(self, selection: Selection) -> Iterator[tuple[pl.DataFrame, RowBlock]]:
         """Read blocks of all columns, each with the selected columns of its rows."""
         return self._read(selection, list(self.names))
 
-    def _read(self, selection: Selection, wanted: list[str]) -> Iterator[tuple[pl.DataFrame, Rows]]:
+    def _read(self, selection: Selection, wanted: list[str]) -> Iterator[tuple[pl.DataFrame, RowBlock]]:
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
-        start = 0
-        for frame in self._batches(wanted):
+        lazy, start = pl.scan_parquet(self._path).select(wanted), 0
+        while not (frame := self._batch(lazy, start)).is_empty():
             numbers = np.empty((frame.height, len(selection.numbers)))
             for k, column in enumerate(selection.numbers):
                 series = frame[self.names[column]].cast(pl.Float64).fill_null(float("nan"))
                 numbers[:, k] = series.to_numpy()
                 self._check(numbers[:, k], start, column, column in selection.gaps)
             labels = tuple(self._labels(frame, start, column) for column in selection.texts)
-            yield frame, Rows(start, numbers, labels)
+            yield frame, RowBlock(start, numbers, labels)
             start += frame.height
 
     @property
@@ -106,41 +102,33 @@ class ParquetTable:
             ) from problem
         return Path(copy.name)
 
-    def _batches(self, wanted: list[str]) -> Iterator[pl.DataFrame]:
-        lazy = pl.scan_parquet(self._path).select(wanted)
-        start = 0
-        while True:
-            with _named_errors(self.name):
-                frame = lazy.slice(start, ROWS).collect()
-            if frame.is_empty():
-                return
-            yield frame
-            start += frame.height
+    def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
+        with _named_errors(self.name):
+            return lazy.slice(start, ROWS).collect()
 
     def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
-        bad = ~(np.abs(numbers) <= LIMIT)
-        if gaps:
-            bad &= ~np.isnan(numbers)
+        bad = ~(np.abs(numbers) <= LIMIT) & ~(np.isnan(numbers) & gaps)
         if bad.any():
             row = int(np.argmax(bad))
             value = numbers[row]
             what = "is empty or nan" if np.isnan(value) else f"{value:g} is too large or infinite"
-            where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
-            raise DataError(f"{where}: {what}; a finite number was expected")
+            raise DataError(f"{self._place(start + row, column)}: {what}; a finite number was expected")
 
     def _labels(self, frame: pl.DataFrame, start: int, column: int) -> list[str]:
         series = frame[self.names[column]]
         try:
             labels: list[str | None] = series.cast(pl.String).to_list()
-        except pl.exceptions.PolarsError:  # lists, or bytes that are no UTF-8
+        except pl.exceptions.PolarsError:  # lists, or bytes that are not UTF-8
             raise DataError(
                 f'{self.name}, column "{series.name}": holds {series.dtype}; text or numbers were expected as labels'
             ) from None
         for row, label in enumerate(labels):
             if not label:
-                where = f'{self.name}, {_row(start + row)}, column "{self.names[column]}"'
-                raise DataError(f"{where}: {NO_LABEL}")
+                raise DataError(f"{self._place(start + row, column)}: {NO_LABEL}")
         return [label or "" for label in labels]
+
+    def _place(self, row: int, column: int) -> str:
+        return f'{self.name}, {_row(row)}, column "{self.names[column]}"'
 
 
 def _row(row: int) -> str:
@@ -149,7 +137,7 @@ def _row(row: int) -> str:
 
 @contextmanager
 def _named_errors(name: str) -> Iterator[None]:
-    """Word what polars finds wrong with a file; a panic of its decoder is no subclass of its errors."""
+    """Raise what polars finds wrong with a file as DataError; a panic of its decoder is no subclass of its errors."""
     try:
         yield
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as problem:
@@ -157,19 +145,17 @@ def _named_errors(name: str) -> Iterator[None]:
         raise DataError(f"{name}: cannot be read as Parquet ({reason})") from problem
 
 
-def frames(table: ParquetTable, change: Change) -> Iterator[pl.DataFrame]:
+def frames(table: Table, change: Change) -> Iterator[pl.DataFrame]:
     """Yield the changed log, block after block."""
+    assert isinstance(table, ParquetTable)
     for frame, rows in table.pairs(change.selection):
         values = np.ascontiguousarray(change.compute(rows.numbers).T)
         new = [pl.Series(name, column) for name, column in zip(change.names, values, strict=True)]
-        for place, column in zip(change.places, new, strict=False):
-            frame.replace_column(place, column)
-        yield frame.hstack(new[len(change.places) :])
+        yield change.put(frame, new)
 
 
 def to_text(table: Table, change: Change, file: IO[bytes]) -> None:
     """Write the changed log as CSV."""
-    assert isinstance(table, ParquetTable)
     for k, frame in enumerate(frames(table, change)):
         with system_errors():
             frame.write_csv(file, include_header=k == 0)
@@ -183,7 +169,6 @@ def to_parquet(table: Table, change: Change, file: IO[bytes]) -> None:
     """
     from polars.io.plugins import register_io_source
 
-    assert isinstance(table, ParquetTable)
     fault: list[BaseException] = []
     blocks = frames(table, change)
     first = next(blocks)
@@ -195,9 +180,7 @@ def to_parquet(table: Table, change: Change, file: IO[bytes]) -> None:
         except BaseException as problem:  # polars would wrap it beyond recognition
             fault.append(problem)
 
-    target = (
-        file.name if isinstance(file.name, str) else file
-    )  # what was open already has no name, but a number
+    target = file.name if isinstance(file.name, str) else file  # an open descriptor has a number for a name
     with system_errors():
         register_io_source(source, schema=first.schema).sink_parquet(target)
     if fault:

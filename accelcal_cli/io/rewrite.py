@@ -1,4 +1,4 @@
-"""A log written anew with more columns, or with others in place of its readings; every other byte stays as it was."""
+"""A text log rewritten with new columns, added or in place of its readings; every other byte stays as it was."""
 
 from __future__ import annotations
 
@@ -10,16 +10,21 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.io.dialect import BOM, Dialect, is_blank
-from accelcal_cli.io.reader import TextTable
-from accelcal_cli.io.stream import Beside
-from accelcal_cli.io.text import Selection, has_outer_blank_line
+from accelcal_cli.io.dialect import BOM, Dialect, is_blank, split_cells
+from accelcal_cli.io.reader import Selection, TextTable, has_outer_blank_line
+from accelcal_cli.io.stream import BackgroundThread
 
-BATCH = 8192  # rows that polars formats at a time
-SMALL = 1 << 20  # bytes: a block up to this size does not need polars
+if TYPE_CHECKING:
+    import polars as pl
+
+BATCH = 8192
+"""Rows that polars formats at a time."""
+
+SMALL = 1 << 20
+"""Bytes: a block up to this size does not need polars."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +43,21 @@ class Change:
     names: Sequence[str]
     places: tuple[int, ...] = ()
 
+    def put(self, frame: pl.DataFrame, columns: list[pl.Series]) -> pl.DataFrame:
+        """Return a frame of old columns with the new ones in their places and at its end."""
+        for place, column in zip(self.places, columns, strict=False):
+            frame.replace_column(place, column)
+        return frame.hstack(columns[len(self.places) :])
+
 
 def rewrite(table: TextTable, change: Change, file: IO[bytes]) -> None:
-    """Write the changed log, block after block, in constant memory: one is written while the next is parsed.
+    """Write the changed log in constant memory: a block is written in the background while the next is parsed.
 
     Raises:
         DataError: a cell that is wrong, by its line and column.
         OSError: the file cannot be written.
     """
-    lines, writing = _Lines(table.dialect, change), Beside()
+    lines, writing = _LineWriter(table.dialect, change), BackgroundThread()
     try:
         for block, rows in table.pairs(change.selection):
             writing.start(partial(lines.write, block, change.compute(rows.numbers), file))
@@ -54,7 +65,7 @@ def rewrite(table: TextTable, change: Change, file: IO[bytes]) -> None:
         writing.wait()
 
 
-class _Lines:
+class _LineWriter:
     """Writes blocks of whole lines, and keeps count of lines across blocks."""
 
     def __init__(self, dialect: Dialect, change: Change) -> None:
@@ -67,32 +78,32 @@ class _Lines:
     def write(self, block: bytes, values: Float, file: IO[bytes]) -> None:
         """Write the changed block: by polars where every line is a plain row, else line by line."""
         end = "\r\n" if b"\r" in block else "\n"
-        if not (self._plain(block, len(values), end.encode()) and self._written(block, values, end, file)):
+        if not (
+            self._plain(block, len(values), end.encode()) and self._write_plain(block, values, end, file)
+        ):
             file.write(self._careful(block, values))
 
     def _plain(self, block: bytes, rows: int, end: bytes) -> bool:
-        """Whether to try polars: past the header, one kind of line ends, no blank line that it would drop."""
-        if len(block) < SMALL or self.quoted or not self.titled or self.line < self.dialect.header_line:
-            return False
-        if not block.endswith(end) or has_outer_blank_line(block):
-            return False
-        if end == b"\r\n" and not block.count(end) == block.count(b"\r") == block.count(b"\n"):
-            return False
-        return not self.change.places or self._regular(block, rows)
+        """Return whether to try polars: past the header, one kind of line ends, no blank line that it would drop."""
+        past_header = self.titled and self.line >= self.dialect.header_line
+        one_end = end == b"\n" or block.count(end) == block.count(b"\r") == block.count(b"\n")
+        whole = one_end and block.endswith(end) and not has_outer_blank_line(block)
+        regular = not self.change.places or self._regular(block, rows)
+        return len(block) >= SMALL and not self.quoted and past_header and whole and regular
 
     def _regular(self, block: bytes, rows: int) -> bool:
-        """Whether separators alone part the cells, as many on every line, and none is left over at its end."""
+        """Return whether only separators divide the cells, as many on every line, with none left at its end."""
         return (
             b'"' not in block
             and self.glue != b" "
             and block.count(self.glue) == (self.dialect.width - 1) * rows
         )
 
-    def _written(self, block: bytes, values: Float, end: str, file: IO[bytes]) -> bool:
+    def _write_plain(self, block: bytes, values: Float, end: str, file: IO[bytes]) -> bool:
         import polars as pl
 
         separator, width = self.dialect.separator, self.dialect.width
-        # A separator that no text has makes one cell of the line.
+        # With a separator that no text has, a line is one cell.
         split, names = (separator, range(width)) if self.change.places else ("\x01", range(1))
         if split == "\x01" and b"\x01" in block:
             return False
@@ -109,11 +120,9 @@ class _Lines:
         if left_over and not self._regular(block, len(values)):
             return False
         new = [pl.Series(f"new {k}", column) for k, column in enumerate(values.T)]
-        for place, column in zip(self.change.places, new, strict=False):
-            frame.replace_column(place, column)
         file.flush()
         with system_errors():
-            frame.hstack(new[len(self.change.places) :]).write_csv(
+            self.change.put(frame, new).write_csv(
                 file,
                 include_header=False,
                 separator=separator,
@@ -152,7 +161,8 @@ class _Lines:
     def _comment(self, line: bytes) -> bytes:
         """Return a comment line; one that names the columns names the new ones, too."""
         body = line.split(b"#", 1)[1]
-        if self.titled or self.dialect.split(body.decode(errors="replace")) != list(self.dialect.names or ()):
+        names = split_cells(body.decode(errors="replace"), self.dialect.separator)
+        if self.titled or names != list(self.dialect.names or ()):
             return line
         self.titled = True
         start = len(line) - len(body)
@@ -171,9 +181,9 @@ class _Lines:
 
 
 def _spans(line: bytes, glue: bytes) -> list[tuple[int, int]]:
-    """Return where the cells of a line start and stop; a separator within quotes parts none."""
+    """Return where the cells of a line start and stop; a separator within quotes divides none."""
     if glue == b" ":
-        return [found.span() for found in re.finditer(rb'"[^"]*"|\S+', line)]
+        return [match.span() for match in re.finditer(rb'"[^"]*"|\S+', line)]
     cuts = [at.start() for at in re.finditer(re.escape(glue), line)]
     if b'"' in line:
         cuts = [at for at in cuts if line.count(b'"', 0, at) % 2 == 0]
@@ -182,7 +192,7 @@ def _spans(line: bytes, glue: bytes) -> list[tuple[int, int]]:
 
 @contextmanager
 def system_errors() -> Iterator[None]:
-    """Give the faults of the system that polars wraps their own class again: a full disk, a reader that left."""
+    """Raise the faults of the system that polars wraps as OSError again: a full disk, a closed pipe."""
     import polars as pl
 
     try:

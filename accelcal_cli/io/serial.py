@@ -1,10 +1,11 @@
-"""Lines of text as they arrive: from a serial port, or from a file that is open."""
+"""Live streams: lines of text as they arrive from a serial port or an open file, and the readings in them."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -17,19 +18,20 @@ if TYPE_CHECKING:
 
 
 LONGEST = 4096
-"""Bytes of a line at most: more without a line end is no text."""
+"""Bytes of a line at most: more without a line end is not text."""
 
 PATIENCE = 100
-"""Lines in a row without the numbers wanted, after which the stream is the wrong one."""
+"""Consecutive lines without the wanted numbers after which the stream is refused."""
 
 SHOWN = 60
+"""Characters of a line that a message shows."""
 
 _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"']+")
 
 
 def file_lines(file: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of an open file as they come."""
-    yield from iter(lambda: file.readline(LONGEST), b"")
+    """Return the lines of an open file as they arrive."""
+    return iter(lambda: file.readline(LONGEST), b"")
 
 
 def port_lines(name: str, baud: int, timeout: float) -> Iterator[bytes]:
@@ -41,7 +43,7 @@ def port_lines(name: str, baud: int, timeout: float) -> Iterator[bytes]:
 
     Raises:
         UsageError: pyserial is missing.
-        DataError: the port cannot be opened, falls silent, or goes.
+        DataError: the port cannot be opened, falls silent, or disappears.
     """
     return _lines(_open(name, baud, timeout), name, timeout)
 
@@ -50,8 +52,13 @@ def _lines(port: Serial, name: str, timeout: float) -> Iterator[bytes]:
     with port:
         rest, started = b"", False
         while True:
-            rest += _received(port, name, timeout)
-            *lines, rest = rest.replace(b"\r", b"\n").split(b"\n")
+            try:
+                chunk: bytes = port.read(max(1, port.in_waiting))
+            except OSError:
+                raise DataError(f"{name}: the port is gone") from None
+            if not chunk:
+                raise DataError(f"{name}: no data for {timeout:g} s")
+            *lines, rest = (rest + chunk).replace(b"\r", b"\n").split(b"\n")
             if len(rest) > LONGEST:
                 raise DataError(
                     f"{name}: {LONGEST} bytes without a line end; is --baud {port.baudrate} right?"
@@ -72,18 +79,8 @@ def _open(name: str, baud: int, timeout: float) -> Serial:
         raise DataError(f"{name}: cannot be opened: {reason.lower()}") from None
 
 
-def _received(port: Serial, name: str, timeout: float) -> bytes:
-    try:
-        chunk: bytes = port.read(max(1, port.in_waiting))
-    except OSError:
-        raise DataError(f"{name}: the port is gone") from None
-    if not chunk:
-        raise DataError(f"{name}: no data for {timeout:g} s")
-    return chunk
-
-
 def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Iterator[Float]:
-    """Yield three numbers of each line, shape (3,); lines without them, such as headers, are passed over.
+    """Yield three numbers of each line, shape (3,); lines without them, such as headers, are skipped.
 
     Raises:
         DataError: line after line without the numbers.
@@ -108,19 +105,17 @@ def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Ite
 
 def pick(line: str, columns: Sequence[int]) -> Float | None:
     """Return three numbers of a line, counted from 0, shape (3,); None when one is missing or not finite."""
-    found = numbers(line)
-    if len(found) <= max(columns):
+    values = numbers(line)
+    if len(values) <= max(columns):
         return None
-    chosen = [found[column] for column in columns]
+    chosen = [values[column] for column in columns]
     return np.array(chosen) if all(map(math.isfinite, chosen)) else None
 
 
 def numbers(line: str) -> list[float]:
-    """Return the numbers of a line in their order, whatever stands between them; words are passed over."""
-    found = []
+    """Return the numbers of a line in their order, whatever is between them; words are skipped."""
+    values = []
     for word in _BETWEEN.split(line):
-        try:
-            found.append(float(word))
-        except ValueError:
-            continue
-    return found
+        with suppress(ValueError):
+            values.append(float(word))
+    return values

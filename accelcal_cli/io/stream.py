@@ -1,8 +1,8 @@
-"""Input bytes: opened, hashed and cut into blocks of whole lines.
+"""Streams of bytes and of rows in constant memory.
 
-A store of rows that moves to a temporary file when it outgrows memory.
-
-One call at a time in a thread beside the caller, for work that releases the interpreter lock.
+`ByteSource` reads a file or standard input once, in blocks of whole lines, and hashes it on the way. `RowStore` keeps
+rows of numbers and moves them to a temporary file when they outgrow memory. Both leave slow work that releases the
+interpreter lock to a `BackgroundThread`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,19 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, did_you_mean
 
-HEAD = 4 << 20  # bytes: an input up to this size is one block and never needs polars
-BLOCK = 16 << 20  # bytes of a later block
-LONGEST_LINE = 1 << 20  # bytes
+HEAD = 4 << 20
+"""Bytes of the first block: an input up to this size is one block and never needs polars."""
 
-_FOREIGN = {  # first bytes of what people hand over instead of text
+BLOCK = 16 << 20
+"""Bytes of a later block."""
+
+LONGEST_LINE = 1 << 20
+"""Bytes of a line at most."""
+
+IN_MEMORY = 1_000_000
+"""Rows of a store that stay in memory."""
+
+_FOREIGN = {  # first bytes of files that users pass instead of text
     b"\x1f\x8b": "gzip-compressed; unpack it first",
     b"PK\x03\x04": "a zip archive or an Excel workbook; export the sheet as CSV",
     b"\xd0\xcf\x11\xe0": "an Excel workbook; export the sheet as CSV",
@@ -39,8 +47,7 @@ _FOREIGN = {  # first bytes of what people hand over instead of text
 class ByteSource:
     """One pass over a file or standard input; `sha256` covers the bytes read so far.
 
-    Hashing runs in a thread beside the parser: hashlib releases the interpreter lock, and at 10 million
-    rows the hash would otherwise cost as much as the parsing.
+    Hashing runs in the background of the parser: at 10 million rows it would otherwise take as long as the parsing.
     """
 
     def __init__(
@@ -64,7 +71,7 @@ class ByteSource:
         self.hashed = hashed
         self._stopped = False
         self._hash = hashlib.sha256()
-        self._hashing, self._reading = Beside(), Beside()
+        self._hashing, self._reading = BackgroundThread(), BackgroundThread()
         self._may_read_ahead = stream.seekable()  # a pipe may block, and with it the end of the program
         self._ahead: bytes | None = None
         raw = self._read(head)
@@ -117,9 +124,9 @@ class ByteSource:
             yield fresh
 
     def _next(self) -> bytes:
-        """Take the block read ahead, have the next one read, and hash this one, beside the parser."""
+        """Return the block read ahead; read the next one and hash this one in the background."""
         self._reading.wait()
-        raw = self._ahead if self._ahead is not None else self._read(self._block)
+        raw = self._read(self._block) if self._ahead is None else self._ahead
         if raw and self._may_read_ahead:
             self._reading.start(self._read_ahead)
         if raw and self.hashed:
@@ -144,7 +151,7 @@ class ByteSource:
 
 
 def open_source(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> ByteSource:
-    """Open a path, or standard input for ``-``."""
+    """Open a path, or standard input for ``-``; DataError says why a path cannot be opened."""
     if str(source) == "-":
         return ByteSource(stdin or sys.stdin.buffer, "<stdin>", hashed=hashed)
     path = Path(source)
@@ -174,9 +181,6 @@ def _neighbour(path: Path) -> str:
     return did_you_mean(path.name, names)
 
 
-IN_MEMORY = 1_000_000  # rows
-
-
 class RowStore:
     """Rows of `width` numbers, appended once and read back in blocks as often as needed.
 
@@ -191,7 +195,7 @@ class RowStore:
         self._limit = limit
         self._parts: list[Float] = []
         self._file: BinaryIO | None = None
-        self._writing = Beside()
+        self._writing = BackgroundThread()
 
     def append(self, rows: Float) -> None:
         """Add rows (B, width)."""
@@ -214,11 +218,11 @@ class RowStore:
             return
         for start in range(0, self.rows, rows):
             self._settle()  # a writer that came between two blocks moves the file's position
-            block = np.empty((min(rows, self.rows - start), self.width))
+            count = min(rows, self.rows - start)
             with _named_disk_errors():
                 self._file.seek(start * self.width * 8)
-                self._fill(block)
-            yield start, block
+                block = np.fromfile(self._file, count=count * self.width)
+            yield start, block.reshape(count, self.width)
 
     def all(self) -> Float:
         """Every row, (rows, width)."""
@@ -249,14 +253,6 @@ class RowStore:
             while view:  # an unbuffered write may take less than all
                 view = view[self._file.write(view) :]
 
-    def _fill(self, block: Float) -> None:
-        view = block.data.cast("B")
-        while view:
-            got = self._file.readinto(view) if self._file is not None else 0  # type: ignore[attr-defined]
-            if not got:
-                raise OSError("the temporary file is shorter than it was written")
-            view = view[got:]
-
 
 @contextmanager
 def _named_disk_errors() -> Iterator[None]:
@@ -271,22 +267,22 @@ def _named_disk_errors() -> Iterator[None]:
         ) from problem
 
 
-class Beside:
-    """Runs calls in order, each beside what the caller does next."""
+class BackgroundThread:
+    """Runs calls in order, one at a time, while the caller goes on."""
 
     def __init__(self) -> None:
-        """Start with nothing under way."""
+        """Start idle."""
         self._thread: Thread | None = None
         self._fault: BaseException | None = None
 
     def start(self, call: Callable[[], object]) -> None:
-        """Wait for the call under way, then start the next."""
+        """Wait for the running call, then start the next one."""
         self.wait()
         self._thread = Thread(target=self._run, args=(call,), daemon=True)
         self._thread.start()
 
     def wait(self) -> None:
-        """Wait for the call under way; raise what it raised."""
+        """Wait for the running call; raise what it raised."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None

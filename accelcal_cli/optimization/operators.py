@@ -1,4 +1,4 @@
-"""Operators on whole populations that several optimizers share: drawing, choosing, pressing into the box."""
+"""Operators on whole populations that several optimizers share: choosing, selecting, clipping to the box."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def gather(x: Float, index: Int) -> Float:
     return out.transpose(0, 2, 1)
 
 
-def press(x: Float, low: Bound, high: Bound) -> None:
-    """Press x, shape (R, P, D), between low and high, in place."""
+def clip(x: Float, low: Bound, high: Bound) -> None:
+    """Clip x, shape (R, P, D), to low and high, in place."""
     if isinstance(low, float):
         x.clip(low, high, out=x)
     else:
@@ -77,7 +77,7 @@ def mutated_genes(u: Float, keep: float, gene: Int) -> Float:
     Args:
         u: uniform numbers, one per gene, shape (R, K, P, D) of K iterations.
         keep: P_c, the probability to keep the parent's gene.
-        gene: J_rand, the gene always taken from the mutant, shape (R, K, P).
+        gene: J_rand, the gene that always comes from the mutant, shape (R, K, P).
     """
     mutated = (u > keep).astype(float)
     runs, iterations, individuals = (np.arange(size) for size in gene.shape)

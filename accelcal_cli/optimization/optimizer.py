@@ -132,7 +132,7 @@ def optimizer_file(name: str) -> Path | None:
     return shipped("optimizers").get(name) or OPTIMIZERS.beside(name, ".yaml")
 
 
-def shipped_parameters(optimizer: Any) -> dict[str, Any]:
+def shipped_parameters(optimizer: object) -> dict[str, Any]:
     """Return the settings that the file of an optimizer states; none for an unknown one."""
     path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
     parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}

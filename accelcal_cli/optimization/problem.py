@@ -24,7 +24,7 @@ class Problem(ABC):
     Attributes:
         name: for tables.
         lower, upper: the box, shape (D,).
-        start: low and high corner of where starting points are drawn; None is the whole box.
+        start: lower and upper corner of the region that starting points are drawn from; None is the whole box.
         minimum: the known least cost, or None.
         has_residuals: whether `residuals` and `jacobian` exist, with cost = sum of squared residuals.
         has_closed_form: whether `closed_form` exists.
@@ -67,7 +67,7 @@ class Problem(ABC):
     def gradient_hessian(self, x: Float) -> tuple[Float, Float]:
         """Return the gradient, shape (R, P, D), and Hessian, (R, P, D, D), of the cost at x, shape (R, P, D).
 
-        By central differences of the cost, 2 D^2 evaluations a point, unless the problem knows better.
+        By central differences of the cost, 2 D^2 evaluations per point, unless the problem knows better.
         """
         return differences(self, x)
 
@@ -147,7 +147,7 @@ class Counted(Problem):
         return r
 
     def jacobian(self, x: Float) -> Float:
-        """Return the Jacobian, counted as one evaluation a point."""
+        """Return the Jacobian, counted as one evaluation per point."""
         self.spent += x.shape[1]
         return self.problem.jacobian(x)
 
@@ -162,7 +162,7 @@ class Counted(Problem):
         return self.problem.groups
 
     def gradient_hessian(self, x: Float) -> tuple[Float, Float]:
-        """Return gradient and Hessian; analytic ones count as one evaluation a point, differences as they are."""
+        """Return gradient and Hessian; analytic ones count as one evaluation per point, differences as they are."""
         if type(self.problem).gradient_hessian is Problem.gradient_hessian:
             return differences(self, x)
         self.spent += x.shape[1]
@@ -186,11 +186,11 @@ class Counted(Problem):
         count = np.count_nonzero(better)
         if not count:
             return
-        found = points(x, column)
+        best = points(x, column)
         if count == len(least):
-            self.best_x, self.best_cost = found, least
+            self.best_x, self.best_cost = best, least
         else:
-            self.best_x = np.where(better[:, None], found, self.best_x)
+            self.best_x = np.where(better[:, None], best, self.best_x)
             self.best_cost = np.minimum(least, self.best_cost)
 
 
@@ -225,5 +225,5 @@ def points(x: Float, index: Int) -> Float:
     """Return the point (or cost) of each run's population, (R, P, ...), at its index, (R,): a copy, shape (R, ...)."""
     if len(index) == 1:  # Indexing by one number is several times as fast as by arrays.
         return x[:, index[0]].copy()
-    chosen: Float = x[np.arange(len(index)), index]
-    return chosen
+    point: Float = x[np.arange(len(index)), index]
+    return point

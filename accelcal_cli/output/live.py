@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
-from accelcal_cli.detection.capture import NEAR, Capture, Held, Status
+from accelcal_cli.detection.capture import NEAR, Capture, CapturedPose, Status
 from accelcal_cli.output.console import console
 from accelcal_cli.output.files import check_target, is_stream, open_stream, unwritten, whole_file
 from accelcal_cli.sensor.poses import describe
@@ -69,11 +69,11 @@ class Watch:
 
     def _taken(self) -> str:
         """Return the line of the latest pose."""
-        index, pose = self.capture.recognised()[-1], self.capture.taken[-1]
+        index, pose = self.capture.recognised()[-1], self.capture.poses[-1]
         name = "not in the plan, kept" if index is None else describe(self.capture.planned[index])
         spread = max(pose.spread)
         left = len(self.capture.missing())
-        return f"pose {len(self.capture.taken)}: {name}; {pose.n} readings, sd {spread:.3g}; {left} to take"
+        return f"pose {len(self.capture.poses)}: {name}; {pose.n} readings, sd {spread:.3g}; {left} to take"
 
     def _drawn(self) -> Group:
         """Return what is held now, which a low terminal must not cut off, and what has become of the poses."""
@@ -143,7 +143,7 @@ class PoseFile:
         """Close what was opened."""
         self._close()
 
-    def save(self, taken: Sequence[Held], *, last: bool = False) -> None:
+    def save(self, taken: Sequence[CapturedPose], *, last: bool = False) -> None:
         """Keep all poses taken so far; `last` says that no more will come.
 
         Raises:
@@ -191,7 +191,7 @@ class PoseFile:
             raise unwritten(self.path, error) from None
 
 
-def _row(number: int, pose: Held) -> str:
+def _row(number: int, pose: CapturedPose) -> str:
     """Return the row of a pose, with the shortest digits that read back to the same numbers."""
     cells = [repr(float(v)) for v in (*pose.mean, *pose.spread)]
     return ",".join([str(number), str(pose.n), *cells]) + "\n"

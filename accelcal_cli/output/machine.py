@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import polars
 
     from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.sensor.simulation import Stretch
+    from accelcal_cli.sensor.simulation import LogSegment
 
 
 def write_csv(table: Table, file: IO[str]) -> None:
@@ -95,7 +95,7 @@ def file_name(label: str) -> str:
 DIGITS = "%.9g"
 
 
-def write_log(stretches: Iterable[Stretch], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
+def write_log(stretches: Iterable[LogSegment], gyro: bool, file: IO[str]) -> list[tuple[int, int]]:
     """Write the rows as they come; return first and last row of each hold, counted from 1."""
     file.write("t,ax,ay,az" + ",wx,wy,wz" * gyro + "\n")
     holds, row = [], 0

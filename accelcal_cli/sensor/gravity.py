@@ -36,7 +36,7 @@ def normal_gravity(latitude: float, height: float = 0.0) -> float:
     import boule
 
     with warnings.catch_warnings():
-        # Below the ellipsoid boule warns; the field of the outside, carried on, is what a valley there has.
+        # Below the ellipsoid boule warns; the field of the outside, continued, is that in a valley there.
         warnings.simplefilter("ignore", UserWarning)
         milligal = boule.WGS84.normal_gravity((0.0, latitude, height))
     return float(milligal) * 1e-5

@@ -5,9 +5,9 @@
 
 N is the output (pulse/s, counts, any linear output), f the specific force in the body frame (m/s^2).
 A rotation of the body frame changes K_a to K_a R^T and leaves every |f| as it was: readings without known
-attitudes fix K_a only up to that rotation, and a gauge is the convention that chooses it.
+attitudes determine K_a only up to that rotation, and a gauge is the convention that chooses it (`to_gauge`).
 
-Engineering units of the error parameters, and of readings.
+The engineering units of the parameters stand at the end: scale-factor errors, misalignment angles, bias as force.
 """
 
 from __future__ import annotations
@@ -26,7 +26,22 @@ Gauge = Literal["lower", "upper", "symmetric", "full"]
 GAUGES: tuple[str, ...] = get_args(Gauge)
 
 SQUARABLE = 1e-6
-"""Least part that the smallest singular value of K is of the largest, if K K^T is to keep digits of it."""
+"""Least ratio of the smallest singular value of K to the largest at which K K^T still has digits of it."""
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2, the conventional value of 1 g (CGPM 1901)."""
+
+PPM = 1e6
+MRAD = 1e3
+ARCSEC = 180 * 3600 / math.pi
+"""Arc seconds in a radian."""
+MICRO_G = 1e6
+
+OUTPUT_OF_1_G = {"g": 1.0, "mg": 1000.0, "m/s^2": STANDARD_GRAVITY, "m/s2": STANDARD_GRAVITY}
+"""By the name of the unit. A sensor with output in one of them has a small bias, unlike one with raw counts."""
+
+AWAY = 2.0
+"""At rest a sensor reads 1 g within this factor, whatever its errors, unless its unit is another one."""
 
 
 def to_gauge(K: Float, gauge: str) -> Float:
@@ -50,10 +65,10 @@ def to_gauge(K: Float, gauge: str) -> Float:
     squared = np.where(poor[..., None, None], np.eye(3), K)
     product = squared @ squared.swapaxes(-1, -2)
     if gauge == "lower":
-        found = cholesky(product)
+        factor = cholesky(product)
         if poor.any():
-            found[poor] = triangular(K[poor])
-        return found
+            factor[poor] = triangular(K[poor])
+        return factor
     values, vectors = eigh(product)
     root: Float = (vectors * np.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2)
     if poor.any():
@@ -102,42 +117,8 @@ class ErrorModel:
         return (self.K_A @ centred).T.reshape(N.shape)
 
     def in_gauge(self, gauge: str) -> ErrorModel:
-        """Return the same sensor seen from the body frame of another gauge. The bias D_a does not change."""
+        """Return the same sensor in the body frame of another gauge. The bias D_a does not change."""
         return ErrorModel(to_gauge(self.K, gauge), self.D)
-
-
-STANDARD_GRAVITY = 9.80665
-"""m/s^2, the conventional value of 1 g (CGPM 1901)."""
-
-PPM = 1e6
-MRAD = 1e3
-ARCSEC = 180 * 3600 / math.pi
-"""Arc seconds in a radian."""
-MICRO_G = 1e6
-
-OUTPUT_OF_1_G = {"g": 1.0, "mg": 1000.0, "m/s^2": STANDARD_GRAVITY, "m/s2": STANDARD_GRAVITY}
-"""By the name of the unit. A sensor that gives its output in one of them has no bias to speak of, unlike raw counts."""
-
-AWAY = 2.0
-"""At rest a sensor reads 1 g within this factor, whatever its errors, or its unit is another one."""
-
-
-def _reads_1_g(length: float, unit: str) -> bool:
-    return OUTPUT_OF_1_G[unit] / AWAY <= length <= OUTPUT_OF_1_G[unit] * AWAY
-
-
-def check_unit(output: Float, unit: str) -> None:
-    """Raise DataError when an output at rest, shape (3,), less its bias, cannot be 1 g in the unit of that name."""
-    length = float(np.linalg.norm(output))
-    if _reads_1_g(length, unit):
-        return
-    other = next((name for name in OUTPUT_OF_1_G if _reads_1_g(length, name)), None)
-    low, high = OUTPUT_OF_1_G[unit] / AWAY, OUTPUT_OF_1_G[unit] * AWAY
-    raise DataError(
-        f"the first pose reads {', '.join(f'{v:.6g}' for v in output)}, length {length:.4g}; expected {low:.4g} to "
-        f"{high:.4g}, about 1 g with --unit {unit}; "
-        + (f"state --unit {other}" if other else "are --unit and --columns right?")
-    )
 
 
 def scale_error(K: Float, nominal: Float) -> Float:
@@ -161,3 +142,21 @@ def bias_force(K: Float, D: Float) -> Float:
     Definition: D_i / K_ii. Units: m/s^2 (units of g when K is per g).
     """
     return np.asarray(D / np.diagonal(K))
+
+
+def check_unit(output: Float, unit: str) -> None:
+    """Raise DataError when an output at rest, shape (3,), less its bias, cannot be 1 g in the unit of that name."""
+    length = float(np.linalg.norm(output))
+    if _reads_1_g(length, unit):
+        return
+    other = next((name for name in OUTPUT_OF_1_G if _reads_1_g(length, name)), None)
+    low, high = OUTPUT_OF_1_G[unit] / AWAY, OUTPUT_OF_1_G[unit] * AWAY
+    raise DataError(
+        f"the first pose reads {', '.join(f'{v:.6g}' for v in output)}, length {length:.4g}; expected {low:.4g} to "
+        f"{high:.4g}, about 1 g with --unit {unit}; "
+        + (f"state --unit {other}" if other else "are --unit and --columns right?")
+    )
+
+
+def _reads_1_g(length: float, unit: str) -> bool:
+    return OUTPUT_OF_1_G[unit] / AWAY <= length <= OUTPUT_OF_1_G[unit] * AWAY

@@ -1,4 +1,4 @@
-"""Pose schemes: sets of unit directions of the specific force in the body frame.
+"""Pose schemes: sets of unit directions of the specific force in the body frame, and words for a pose.
 
 At rest the specific force points up, so a pose "+x up" has the direction (1, 0, 0).
 """
@@ -65,7 +65,7 @@ def turns() -> Float:
     """Return the 24 positions of the AKPSO paper, shape (24, 3).
 
     Eight turns of 45 degrees about a horizontal body axis, for each of three axes. The six faces occur twice:
-    18 directions are distinct, the doubles average noise. [akpso2015] section 3.
+    18 directions are distinct, the duplicates average noise. [akpso2015] section 3.
     """
     angle = np.pi / 4 * np.arange(8)
     sine, cosine, zero = np.sin(angle), np.cos(angle), np.zeros(8)
@@ -89,6 +89,11 @@ def fibonacci(count: int) -> Float:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
+def fixture_directions() -> Float:
+    """Return the 26 directions of the faces, edges and corners of a cube, shape (26, 3)."""
+    return np.concatenate([faces(), edges(), corners()])
+
+
 FIXED = {
     "faces": faces,
     "edges": edges,
@@ -96,7 +101,7 @@ FIXED = {
     "icosahedron": icosahedron,
     "turns": turns,
 }
-"""Schemes with a number of poses of their own."""
+"""Schemes with a fixed number of poses."""
 
 SCHEMES = (*FIXED, "fibonacci", "random")
 
@@ -150,8 +155,3 @@ def describe(direction: Float) -> str:
         return f"corner between {name[0]}, {name[1]} and {name[2]} up"
     turn = math.degrees(math.atan2(size[2], size[1]))
     return f"{name[0]} up, tilted {tilt:.0f} degrees towards {name[1]} turned {turn:.0f} degrees to {name[2]}"
-
-
-def fixture_directions() -> Float:
-    """Return what can be held against a cube and its edges and corners: 26 directions, shape (26, 3)."""
-    return np.concatenate([faces(), edges(), corners()])

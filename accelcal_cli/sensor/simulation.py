@@ -1,6 +1,6 @@
-"""A sensor of known errors, and the readings it would give.
+"""A sensor of known errors, and what it would read: static readings, or a raw log.
 
-A simulated raw log: poses held by a hand, and moves between them, as a calibration at a desk goes.
+The raw log is that of a calibration at a desk: poses held by hand, and moves between them.
 """
 
 from __future__ import annotations
@@ -19,21 +19,34 @@ from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import ErrorModel
 
-"""Streams of the noise, of random attitudes and of sensors drawn from their type."""
+HOLD_SPREAD = 0.2
+"""Holds last up to this part longer or shorter than stated."""
+
+SHAKE = 2.0
+"""m/s^2 that a hand adds while it moves the sensor."""
+
+TREMOR_RATE = 9.0
+"""Hz: a hand trembles at 8 to 12 Hz."""
+
+GYRO_BIAS = np.array([0.012, -0.008, 0.005])
+"""rad/s, of the simulated gyroscope."""
+
+GYRO_NOISE = 0.002
+"""rad/s, one sigma of one sample and axis."""
 
 Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How sensors of one type differ: one-sigma of their errors."""
+    """How sensors of one type differ: one sigma of their errors."""
 
     scale: float = setting(0.0, "scale factor, part of nominal", low=0, high=0.2)
     misalignment: float = setting(0.0, "misalignment, rad", low=0, high=0.2)
     bias: float = setting(0.0, "bias, m/s^2", low=0, high=50)
 
     def __post_init__(self) -> None:
-        """Refuse a spread outside its range."""
+        """Raise ConfigError for a spread outside its range."""
         check(self)
 
 
@@ -50,7 +63,7 @@ class Sensor:
     spread: Spread = Spread()
 
     def __post_init__(self) -> None:
-        """Refuse a sensor without an invertible matrix."""
+        """Raise ConfigError for a sensor without an invertible matrix."""
         check(self)
         if self.K_a is None:
             raise ConfigError("K_a: missing; expected three rows of three numbers")
@@ -80,8 +93,8 @@ def load_sensor(name: str) -> Sensor:
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """Simulated static samples.
+class SimulatedReadings:
+    """Samples of a simulated sensor at rest.
 
     Attributes:
         pose: number of the pose of each sample, from 1, shape (n,).
@@ -95,13 +108,13 @@ class Simulated:
 
 
 def draw(sensor: Sensor, runs: Sequence[int], seed: int) -> ErrorModel:
-    """Return sensors of one type, one a run: K of shape (R, 3, 3), D of shape (R, 3).
+    """Return sensors of one type, one per run: K of shape (R, 3, 3), D of shape (R, 3).
 
     Around the ideal sensor of the type (its mean scale factor, no misalignment, no bias) with its spread.
 
     Args:
         sensor: the type.
-        runs: numbers of the runs; run r draws the same sensor in any company.
+        runs: numbers of the runs; run r draws the same sensor whatever the other runs.
         seed: of all draws.
     """
     z = Streams(seed, runs, Purpose.SENSOR).normal(4, 3)
@@ -112,7 +125,7 @@ def draw(sensor: Sensor, runs: Sequence[int], seed: int) -> ErrorModel:
     return ErrorModel(scale[..., None] * turned, scale * sensor.spread.bias * z[:, 3])
 
 
-def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, seed: int) -> Simulated:
+def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, seed: int) -> SimulatedReadings:
     """Return what a sensor at rest reads.
 
     Args:
@@ -128,55 +141,31 @@ def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, see
 
 def simulate_fleet(
     sensor: Sensor, sensors: int, u: Float, g: float, samples: int, noise: float, seed: int
-) -> Iterator[tuple[ErrorModel, Simulated]]:
+) -> Iterator[tuple[ErrorModel, SimulatedReadings]]:
     """Yield sensors of one type, drawn with its spread, and what each reads at rest; see `simulate` and `draw`."""
-    drawn = draw(sensor, range(sensors), seed)
-    for run in range(sensors):
-        model = ErrorModel(drawn.K[run], drawn.D[run])
+    models = draw(sensor, range(sensors), seed)
+    for run, (K, D) in enumerate(zip(models.K, models.D, strict=True)):
+        model = ErrorModel(K, D)
         yield model, _readings(model, u, g, samples, noise, Streams(seed, [run], Purpose.NOISE))
-
-
-def _readings(
-    model: ErrorModel, u: Float, g: float, samples: int, noise: float, random: Streams
-) -> Simulated:
-    force = np.repeat(g * u, samples, axis=0)
-    output = model.output(force + noise * random.normal(len(force), 3)[0])
-    return Simulated(np.repeat(np.arange(1, len(u) + 1), samples), output, force)
-
-
-HOLD_SPREAD = 0.2
-"""Holds last up to this part longer or shorter than stated."""
-
-SHAKE = 2.0
-"""m/s^2 that a hand adds while it moves the sensor."""
-
-TREMOR_RATE = 9.0
-"""Hz: a hand trembles at 8 to 12 Hz."""
-
-GYRO_BIAS = np.array([0.012, -0.008, 0.005])
-"""rad/s, of the simulated gyroscope."""
-
-GYRO_NOISE = 0.002
-"""rad/s, one sigma of one sample and axis."""
 
 
 @dataclass(frozen=True)
 class Handling:
     """How the sensor is held and moved."""
 
-    rate: float = setting(100.0, "rows a second, Hz", low=1, high=1e5)
+    rate: float = setting(100.0, "rows per second, Hz", low=1, high=1e5)
     hold: float = setting(5.0, "seconds that a pose is held, within a fifth", above=0, high=1e5)
     move: float = setting(2.0, "seconds of a move", above=0, high=1e5)
     tremor: float = setting(0.0, "trembling of a hand that holds it, m/s^2 rms", low=0, high=10)
 
     def __post_init__(self) -> None:
-        """Refuse a value outside its range."""
+        """Raise ConfigError for a value outside its range."""
         check(self)
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """A hold or a move.
+class LogSegment:
+    """A hold or a move of a simulated raw log.
 
     Attributes:
         pose: number of the pose that is held, from 1; 0 in a move.
@@ -189,10 +178,10 @@ class Stretch:
     gyro: Float
 
 
-def handled(
+def simulate_log(
     sensor: Sensor, u: Float, g: float, handling: Handling, noise: float, seed: int
-) -> Iterator[Stretch]:
-    """Yield a raw log stretch by stretch: a hold for every direction, a move between two.
+) -> Iterator[LogSegment]:
+    """Yield a raw log segment by segment: a hold for every direction, a move between two.
 
     Args:
         sensor: the sensor.
@@ -200,36 +189,44 @@ def handled(
         g: local gravity, m/s^2.
         handling: times and tremor.
         noise: one sigma of one sample and axis, m/s^2.
-        seed: of everything random; a stretch draws from a stream of its own.
+        seed: of everything random; each segment draws from its own stream.
     """
     row = 0
     for k in range(2 * len(u) - 1):
         streams = Streams(seed, [k], Purpose.RAW_LOG)
-        lottery = streams.uniform(1, 8)[0, 0]
+        draws = streams.uniform(1, 8)[0, 0]
         at, still = k // 2, k % 2 == 0
-        seconds = handling.hold * (1 + HOLD_SPREAD * (2 * lottery[0] - 1)) if still else handling.move
+        seconds = handling.hold * (1 + HOLD_SPREAD * (2 * draws[0] - 1)) if still else handling.move
         n = max(2, round(seconds * handling.rate))
         phase = (np.arange(n) + 0.5) / n
         if still:
-            force, rate = _held(g * u[at], phase * n / handling.rate, handling.tremor, lottery[1:4])
+            force, rate = _hold(g * u[at], phase * n / handling.rate, handling.tremor, draws[1:4])
         else:
-            force, rate = _moved(u[at], u[at + 1], g, phase, n / handling.rate, lottery[1:4])
+            force, rate = _move(u[at], u[at + 1], g, phase, n / handling.rate, draws[1:4])
         force = force + noise * streams.normal(n, 3)[0]
         rate = rate + GYRO_BIAS + GYRO_NOISE * streams.normal(n, 3)[0]
         time = (row + np.arange(n)) / handling.rate
-        yield Stretch(at + 1 if still else 0, time, sensor.model.output(force), rate)
+        yield LogSegment(at + 1 if still else 0, time, sensor.model.output(force), rate)
         row += n
 
 
-def _held(f: Float, t: Float, tremor: float, lottery: Float) -> tuple[Float, Float]:
+def _readings(
+    model: ErrorModel, u: Float, g: float, samples: int, noise: float, random: Streams
+) -> SimulatedReadings:
+    force = np.repeat(g * u, samples, axis=0)
+    output = model.output(force + noise * random.normal(len(force), 3)[0])
+    return SimulatedReadings(np.repeat(np.arange(1, len(u) + 1), samples), output, force)
+
+
+def _hold(f: Float, t: Float, tremor: float, draws: Float) -> tuple[Float, Float]:
     """Return specific force and turning rate of a hold, both (n, 3): a tilt that swings moves gravity."""
-    angle = 2 * math.pi * (TREMOR_RATE * t[:, None] + lottery)
+    angle = 2 * math.pi * (TREMOR_RATE * t[:, None] + draws)
     force = f + math.sqrt(2.0) * tremor * np.sin(angle)
     swing = math.sqrt(2.0) * tremor / float(np.linalg.norm(f)) * 2 * math.pi * TREMOR_RATE
     return force, swing * np.cos(angle)
 
 
-def _moved(a: Float, b: Float, g: float, phase: Float, seconds: float, lottery: Float) -> tuple[Float, Float]:
+def _move(a: Float, b: Float, g: float, phase: Float, seconds: float, draws: Float) -> tuple[Float, Float]:
     """Return specific force and turning rate, both (n, 3), of a turn from direction a to b with a shake."""
     axis = np.cross(a, b)
     if np.linalg.norm(axis) < 1e-9:  # the same direction, or the opposite one
@@ -240,5 +237,5 @@ def _moved(a: Float, b: Float, g: float, phase: Float, seconds: float, lottery: 
     turned = angle * (phase**3 * (10 - 15 * phase + 6 * phase**2))[:, None]
     rate = angle / seconds * (30 * phase**2 * (1 - phase) ** 2)[:, None]
     u = a * np.cos(turned) + np.cross(axis, a) * np.sin(turned)
-    shake = SHAKE * np.sin(np.pi * phase[:, None]) * np.sin(2 * np.pi * (3 * phase[:, None] + lottery))
+    shake = SHAKE * np.sin(np.pi * phase[:, None]) * np.sin(2 * np.pi * (3 * phase[:, None] + draws))
     return g * u + shake, -axis * rate  # the world turns against the body

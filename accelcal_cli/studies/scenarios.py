@@ -12,12 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.box import SHIFT, half_widths
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.observability import information
 from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress_each, fit_ellipsoid, pack
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import packed, polish
+from accelcal_cli.calibration.search import SHIFT, half_widths, packed, polish
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings
@@ -102,7 +100,7 @@ class CalibrationBlock:
         truth = ErrorModel(to_gauge(K, "lower"), D)
         theta = pack(truth.K, truth.D, 9)
         at_truth = Loetters(clean, problem.g, Box(np.zeros_like(theta), np.ones_like(theta)))
-        return cls(problem, truth, least, information(at_truth, theta))
+        return cls(problem, truth, least, at_truth.information(theta))
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,17 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration import distributions as chances
-from accelcal_cli.calibration import observability as quality
 from accelcal_cli.calibration.assess import is_large, large_residuals, not_fitting, ratio_in_words
 from accelcal_cli.calibration.distributions import Noise, Pair
 from accelcal_cli.calibration.fit import beyond_chance, length_error, leverages, room_of, studentise
-from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED, Observability, design
-from accelcal_cli.calibration.problem import ROWS_COLUMNS, Box, Loetters, compress, pack
+from accelcal_cli.calibration.observability import (
+    PARAMETERS,
+    ROWS_COLUMNS,
+    UNDETERMINED,
+    Observability,
+    design,
+)
+from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import modulus_errors, polish
@@ -292,7 +297,7 @@ def shift(old: Calibration, readings: Readings) -> Shift:
     """Return what new readings say of the nine parameters: a fit where they determine all, else one linear step."""
     problem = _problem(old, readings)
     start = np.zeros((1, 9))
-    J, e = quality.jacobian(problem, start)[0], problem.residuals(start[:, None])[0, 0] / (2.0 * old.g)
+    J, e = problem.design(start)[0], problem.residuals(start[:, None])[0, 0] / (2.0 * old.g)
     values, vectors = np.linalg.eigh(J.T @ J)
     # A direction with less information has an error above UNDETERMINED times the noise of a pose.
     seen = values > 1.0 / UNDETERMINED**2
@@ -307,7 +312,7 @@ def shift(old: Calibration, readings: Readings) -> Shift:
         return Shift(value, inverse, basis, known, noise, old.model.in_gauge("lower"), value)
     x = polish(problem, start).x
     variance = float(problem.cost(x[:, None])[0, 0]) / (4.0 * old.g**2) / max(readings.poses - 9, 1)
-    cofactor = Observability.of(quality.information(problem, x)[0], readings.poses).cofactor
+    cofactor = Observability.of(problem.information(x)[0], readings.poses).cofactor
     value = _between(problem, start, x)
     noise = Noise(variance, readings.poses - 9)
     (K,), (D,) = problem.parameters(x)

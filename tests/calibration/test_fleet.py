@@ -342,8 +342,7 @@ def test_a_broken_sensor_has_the_cautions_of_calibrate(clipped, tmp_path):
     (table,) = [t for t in summary(fleet, readings.sensors, [], G) if t.title == "Cautions"]
     assert [row[0] for row in table.rows] == ["S07", "S12"]
     assert table.rows[0][1] == pytest.approx(100 * fleet.s[7] / G)
-    assert table.rows[0][3].startswith("Residuals are too large")
-    assert table.rows[0][3].endswith("is much for an accelerometer at rest")
+    assert table.rows[0][3] == "Residuals are too large"
     assert table.rows[1][2:] == ("line 295", "Outlier")
     rows = sensors(fleet, readings.sensors, []).records()
     assert [row["sensor"] for row in rows if row["caution"]] == ["S07", "S12"]

@@ -15,10 +15,9 @@ from accelcal_cli.calibration.fit import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.exporters.base import Target
-from accelcal_cli.exporters.formats import export
+from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import Readings
-from accelcal_cli.navigation.ins import Grade
+from accelcal_cli.navigation.ins import InsGrade
 from accelcal_cli.navigation.study import grade_of
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge
@@ -148,10 +147,10 @@ def test_how_the_sensor_lies_in_the_body_does_not_matter(turn):
     assert found.rms_before == pytest.approx(straight.rms_before)
     for row, other in zip(engineering(found).rows, engineering(straight).rows, strict=True):
         np.testing.assert_allclose([row[1], row[2]], [other[1], other[2]], rtol=1e-6)
-    assert grade_of(found, Grade(), "r").accelerometer == pytest.approx(
-        grade_of(straight, Grade(), "r").accelerometer
+    assert grade_of(found, InsGrade(), "r").accelerometer == pytest.approx(
+        grade_of(straight, InsGrade(), "r").accelerometer
     )
-    record = json.loads(export(found, "imucal", Target()).content)
+    record = json.loads(EXPORTERS.get("imucal")().export(found).content)
     np.testing.assert_allclose(np.diagonal(record["K_a"]), np.linalg.norm(MEMS.K, axis=1), rtol=1e-3)
 
 

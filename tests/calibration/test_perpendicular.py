@@ -14,8 +14,7 @@ from accelcal_cli.calibration.fleet import check_settings
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.exporters.base import Target
-from accelcal_cli.exporters.formats import export
+from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.planning.plan import plan
@@ -136,5 +135,5 @@ def test_nothing_is_dropped_that_was_not_estimated():
     result = calibrate(read(poses.turns(), sigma=1e-2), SIX)
     scale = float(np.diagonal(result.K_a).mean())
     for name in ("px4", "ardupilot"):
-        made = export(result, name, Target(driver_scale=scale))
+        made = EXPORTERS.get(name)(driver_scale=scale).export(result)
         assert not any("misalignments" in warning for warning in made.warnings)

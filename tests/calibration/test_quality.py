@@ -81,7 +81,7 @@ def test_information_from_compressed_readings_is_that_of_the_poses(seed):
     model = ErrorModel(MEMS.in_gauge("lower").K, MEMS.D)
     u = poses.fibonacci(17) @ rotation(seed)
     problem = loetters(model.output(G * u), G, Box(np.zeros((1, 9)), np.ones((1, 9))))
-    got = quality.information(problem, problem.coordinates(model.K[None], model.D[None]))[0]
+    got = problem.information(problem.coordinates(model.K[None], model.D[None]))[0]
     rows = _numeric_rows(model, u)
     np.testing.assert_allclose(got, rows.T @ rows, atol=1e-6 * np.abs(got).max())
 
@@ -99,7 +99,7 @@ def test_dilution_depends_on_the_poses_alone():
         model = ErrorModel(factor * np.eye(3), np.full(3, 0.1 * factor))
         problem = loetters(model.output(g * poses.turns()), g, Box(np.zeros((1, 9)), np.ones((1, 9))))
         x = problem.coordinates(model.K[None], model.D[None])
-        values.append(Observability.of(quality.information(problem, x)[0], 24).dop)
+        values.append(Observability.of(problem.information(x)[0], 24).dop)
     np.testing.assert_allclose(values[1], values[0], rtol=1e-9)
     np.testing.assert_allclose(values[2], values[0], rtol=1e-9)
     np.testing.assert_allclose(values[0], _of(poses.turns()).dop, rtol=1e-9)
@@ -260,7 +260,7 @@ def test_sigma_of_a_real_fit_is_what_repeated_noise_gives():
     x = minimize(problem, LevenbergMarquardt(), runs=runs, start=np.zeros((runs, 1, 9)), trace=False).x
     K, D = problem.parameters(x)
     one = problem.take(np.array([0]))
-    information = quality.information(one, one.coordinates(truth.K[None], truth.D[None]))[0]
+    information = one.information(one.coordinates(truth.K[None], truth.D[None]))[0]
     covariance = sigma**2 * np.linalg.inv(information)
     for gauge in ("lower", "upper", "symmetric"):
         sigma_K, sigma_D = propagate(to_gauge(truth.K, gauge), truth.K, covariance, gauge, G)

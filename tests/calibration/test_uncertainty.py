@@ -39,7 +39,7 @@ class Fits:
         self.K, self.D = problem.parameters(self.run.x)
         self.freedom = len(u) - 9
         self.s2 = self.run.cost / (4 * G**2) / self.freedom
-        self.cofactor = np.linalg.inv(quality.information(problem, self.run.x))
+        self.cofactor = np.linalg.inv(problem.information(self.run.x))
         self.errors = self._errors()
 
     def _errors(self):

@@ -1,4 +1,4 @@
-"""A package of somebody else adds an optimizer, with no file of this project edited.
+"""A package of somebody else adds an optimizer and an exporter, with no file of this project edited.
 
 `plugin/` is built and installed beside the project, as pip would, and found by its entry points alone.
 """
@@ -46,15 +46,15 @@ def site(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def altered(site, tmp_path):
-    """A function that installs the package with one line of its optimizer replaced."""
+    """A function that installs the package with one line of it replaced."""
 
-    def alter(old: str, new: str) -> Path:
+    def alter(old: str, new: str, module: str = "grey_wolf.py") -> Path:
         copy = tmp_path / "site"
         shutil.copytree(site, copy, ignore=shutil.ignore_patterns("__pycache__"))
-        module = copy / "accelcal_grey_wolf" / "grey_wolf.py"
-        text = module.read_text("utf-8")
+        file = copy / "accelcal_grey_wolf" / module
+        text = file.read_text("utf-8")
         assert text.count(old) == 1
-        module.write_text(text.replace(old, new), "utf-8")
+        file.write_text(text.replace(old, new), "utf-8")
         return copy
 
     return alter
@@ -66,9 +66,9 @@ def accelcal(site: Path, line: str) -> str:
     return done.stdout
 
 
-def contract(site: Path, names: str) -> subprocess.CompletedProcess[str]:
+def contract(site: Path, names: str, kind: str = "optimizers") -> subprocess.CompletedProcess[str]:
     """Run the project's contract tests of these names."""
-    file = str(HERE / "test_optimizers.py")
+    file = str(HERE / f"test_{kind}.py")
     return call(site, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", file, "-k", names)
 
 
@@ -108,6 +108,28 @@ def test_it_keeps_the_contract(site):
     done = contract(site, "grey-wolf")
     assert done.returncode == 0, done.stdout
     assert "skipped" not in done.stdout
+
+
+def test_the_exporter_is_in_the_help_and_writes_its_file(site, tmp_path):
+    shown = accelcal(site, "export --help")
+    assert "text" in shown.split("--to", 1)[1].split("--output", 1)[0]
+    assert "--digits" in shown
+    result = str(tmp_path / "result.yaml")
+    accelcal(site, f"calibrate {SAMPLE} --g 9.80665 --optimizer levenberg-marquardt --quiet -o {result}")
+    lines = accelcal(site, f"export {result} --to text --digits 4").splitlines()
+    assert lines[0].startswith("accelcal ")
+    assert [len(line.split()) for line in lines[lines.index("K_a") + 1 :]] == [3, 3, 3, 1, 3]
+
+
+def test_the_exporter_keeps_the_contract(site):
+    done = contract(site, "test_the_contract and text", "exporters")
+    assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
+
+
+def test_an_exporter_without_its_origin_breaks_the_contract(altered):
+    bare = altered("[*origin(result), ", "[", module="text.py")
+    done = contract(bare, "test_the_contract and text", "exporters")
+    assert (done.returncode, "AssertionError: no " in done.stdout) == (1, True), done.stdout
 
 
 def test_without_its_update_it_breaks_the_contract_for_the_right_reason(altered):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from accelcal_cli.navigation.gravity_map import PRESETS, generate
-from accelcal_cli.navigation.ins import Grade
+from accelcal_cli.navigation.ins import InsGrade
 from accelcal_cli.navigation.scenario import simulate
-from accelcal_cli.navigation.voyage import Plan
+from accelcal_cli.navigation.voyage import PlannedVoyage
 
 
 @pytest.fixture(scope="session")
@@ -18,4 +18,4 @@ def rough():
 @pytest.fixture(scope="session")
 def voyage(rough):
     """Six runs of the whole voyage, a measurement every 30 s."""
-    return simulate(rough, Plan(), Grade(), runs=range(6), seed=1, period=30.0)
+    return simulate(rough, PlannedVoyage(), InsGrade(), runs=range(6), seed=1, period=30.0)

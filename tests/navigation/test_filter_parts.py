@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from accelcal_cli.navigation.filters.de_pf import Gaussian, Marginal, metropolis
-from accelcal_cli.navigation.filters.reference import Bank, Reference, _widened
+from accelcal_cli.navigation.filters.reference import Bank, Reference, _inflate
 from accelcal_cli.navigation.gravity_map import PRESETS, generate
-from accelcal_cli.navigation.ins import Grade, metres_per_radian
-from accelcal_cli.navigation.particle_filter import FILTERS, Cloud, Track
+from accelcal_cli.navigation.ins import InsGrade, metres_per_radian
+from accelcal_cli.navigation.marginal import Gaussian, MarginalFilter, TrackWindow, de_mc_generation
+from accelcal_cli.navigation.particle_filter import FILTERS, Cloud, PositionEstimates, normalise
 from accelcal_cli.navigation.scenario import simulate, transitions
 from accelcal_cli.navigation.scores import bound
-from accelcal_cli.navigation.voyage import Plan
+from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
 
 WINDOW = 5
@@ -29,7 +29,7 @@ def step_noise(grade, period):
 def flat():
     """Two runs where the map tells nothing, a measurement every 30 s."""
     field = generate(PRESETS["constant"], 0)
-    return simulate(field, Plan(hours=2.5), Grade(), runs=range(2), seed=1, period=30.0)
+    return simulate(field, PlannedVoyage(hours=2.5), InsGrade(), runs=range(2), seed=1, period=30.0)
 
 
 # The bound
@@ -37,22 +37,20 @@ def flat():
 
 def test_the_bound_is_the_covariance_of_a_kalman_filter_on_the_true_track(voyage):
     """In the information form, with the slope of the map from differences of its values, 1 cm to either side."""
-    route, values = voyage.route, voyage.gravity_map.at
-    scale = np.stack(metres_per_radian(route.latitude), axis=1)
+    true, values = voyage.true, voyage.gravity_map.at
+    scale = np.stack(metres_per_radian(true.latitude), axis=1)
     north, east = (0.01 / scale).T
     slope = (
         np.stack(
             [
-                values(route.latitude + north, route.longitude)
-                - values(route.latitude - north, route.longitude),
-                values(route.latitude, route.longitude + east)
-                - values(route.latitude, route.longitude - east),
+                values(true.latitude + north, true.longitude) - values(true.latitude - north, true.longitude),
+                values(true.latitude, true.longitude + east) - values(true.latitude, true.longitude - east),
             ],
             axis=1,
         )
         / 0.02
     )
-    F = transitions(route, voyage.turns, (0, voyage.epochs), voyage.period, voyage.grade)
+    F = transitions(true, voyage.turns, voyage.grade, 0, voyage.epochs)
     Q, P = step_noise(voyage.grade, voyage.period), np.diag(voyage.prior())
     expected = np.empty((voyage.epochs, 2))
     for k in range(voyage.epochs):
@@ -75,8 +73,8 @@ def carried_on(scenario, form, state, edge, measured=None):
     if measured is not None:
         scenario = dataclasses.replace(scenario, measured=measured)
     u = Streams(4, range(2)).normal(form.particles, 2)
-    track = Track.empty(scenario)
-    found, _ = form._window(scenario, state, u, (0, WINDOW, edge), track, Streams(5, range(2)))
+    window = TrackWindow.predict(scenario, state, 0, WINDOW)
+    found, _ = form.step(window, u, edge, PositionEstimates.empty(scenario), Streams(5, range(2)))
     return found.root @ found.root.swapaxes(1, 2), u
 
 
@@ -109,7 +107,7 @@ def close(found, expected):
 @pytest.mark.parametrize("inflation", [1.0, 1.3])
 def test_a_window_that_shows_nothing_is_a_kalman_prediction_inflated(flat, inflation):
     """All weights are equal: the particles are kept, and their moments are those of the start."""
-    form = Marginal(50, 0, WINDOW, 1.0, inflation, 4.0)
+    form = MarginalFilter(50, 0, WINDOW, 1.0, inflation, 4.0)
     state = start(flat, 0.5)
     found, u = carried_on(flat, form, state, np.inf)
     moments = np.array([np.cov(cloud.T, bias=True) for cloud in u])
@@ -126,7 +124,7 @@ def test_a_window_that_shows_nothing_is_a_kalman_prediction_inflated(flat, infla
     ],
 )
 def test_a_window_that_nothing_explains_widens_the_whole_covariance(flat, part, edge, off, grows):
-    form = Marginal(50, 0, WINDOW, 1.0, 1.0, 4.0)
+    form = MarginalFilter(50, 0, WINDOW, 1.0, 1.0, 4.0)
     state = start(flat, part)
     found, u = carried_on(flat, form, state, edge, flat.measured + off)
     moments = np.array([np.cov(cloud.T, bias=True) for cloud in u])
@@ -141,7 +139,7 @@ def test_a_component_that_does_not_fit_grows_to_the_initial_error_at_most():
     P = np.tile(np.diag(np.r_[200.0**2, 200.0**2, np.ones(10)]), (3, 1, 1))
     P[2, 0, 0] = 2100.0**2
     bank = Bank(np.zeros(3, int), np.zeros((3, 12)), P, np.zeros(3), np.array([3.9, 4.1, 4.1]))
-    found = _widened(bank, 2000.0, 2.5)
+    found = _inflate(bank, 2000.0, 2.5)
     np.testing.assert_array_equal(found.P, P * np.array([1.0, 2.5, 1.0])[:, None, None])
     np.testing.assert_array_equal(found.misfit, [3.9, 1.0, 4.1])
 
@@ -152,8 +150,10 @@ def test_a_track_that_does_not_fit_widens_the_reference(voyage):
     measured[:, 120:] += 50.0
     spoiled = dataclasses.replace(voyage, measured=measured)
     size = {
-        swell: np.einsum("rkii->rk", Reference(swell=swell).run(spoiled, Streams(0, range(6))).covariance)
-        for swell in (1.0, 4.0)
+        growth: np.einsum(
+            "rkii->rk", Reference(recovery_inflation=growth).run(spoiled, Streams(0, range(6))).covariance
+        )
+        for growth in (1.0, 4.0)
     }
     np.testing.assert_array_equal(size[4.0][:, :120], size[1.0][:, :120])
     assert np.median(size[4.0][:, 160:]) > 4 * np.median(size[1.0][:, 160:])
@@ -165,7 +165,9 @@ def test_a_track_that_does_not_fit_widens_the_reference(voyage):
 def test_a_metropolis_move_leaves_the_line_of_the_cloud_by_a_thousandth_of_sigma():
     x = np.zeros((1, 2000, 2))
     x[0, :, 0] = 50.0 * Streams(2, [0]).normal(2000, 1)[0, :, 0]
-    moved, _ = metropolis(x, np.zeros((1, 2000)), lambda v: np.zeros(v.shape[:2]), Streams(3, [0]), 50.0)
+    moved, _ = de_mc_generation(
+        x, np.zeros((1, 2000)), lambda v: np.zeros(v.shape[:2]), Streams(3, [0]), 50.0
+    )
     first = moved[0, :1000, 1]  # the other half takes its differences from these
     assert np.std(first) == pytest.approx(0.05, rel=0.07)
     assert abs(np.mean(first)) < 0.006
@@ -174,14 +176,15 @@ def test_a_metropolis_move_leaves_the_line_of_the_cloud_by_a_thousandth_of_sigma
 @pytest.mark.parametrize("name", ["de-pf", "pso-pf", "apo-pf"])
 def test_particles_that_move_keep_the_weight_that_they_had_together(flat, name):
     """Where the map shows nothing an evolution must not make a place more likely."""
-    settings = {"particles": 50, "road": "safe"} if name == "de-pf" else {"particles": 50}
+    settings = {"particles": 50, "strategy": "safe"} if name == "de-pf" else {"particles": 50}
     form = FILTERS.build(name, settings, "test")
     streams = Streams(6, range(2), Purpose.FILTER)
     logs = 3.0 * Streams(7, range(2)).normal(50, 1)[..., 0]
     logs -= logs.max(axis=1, keepdims=True)  # as the filter carries them on
     before = np.exp(logs) / np.exp(logs).sum(axis=1, keepdims=True)
     x = 300.0 * streams.normal(50, 2)
-    cloud, after, *_ = form.update(flat, Cloud(x.copy(), logs), 0, streams)
+    cloud, *_ = form.update(flat, Cloud(x.copy(), logs), 0, streams)
+    after = normalise(cloud.log_weights)
     order = np.argsort(before, axis=1)
     sorted_before = np.take_along_axis(before, order, axis=1)
     assert (cloud.x != np.take_along_axis(x, order[..., None], axis=1)).any(axis=2)[:, :10].sum() > 10

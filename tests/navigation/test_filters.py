@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.navigation.filters.apo_pf import forces, masses
-from accelcal_cli.navigation.filters.de_pf import IDLE, Operators, evolve, metropolis
+from accelcal_cli.navigation.filters.de_pf import IDLE, DePf
 from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, generate
-from accelcal_cli.navigation.ins import Grade
-from accelcal_cli.navigation.particle_filter import FILTERS, SCHEMES, effective_size, normalised
+from accelcal_cli.navigation.ins import InsGrade
+from accelcal_cli.navigation.marginal import de_mc_generation
+from accelcal_cli.navigation.particle_filter import FILTERS, SCHEMES, effective_size, normalise
 from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import bound, counted, score
-from accelcal_cli.navigation.voyage import Plan
+from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
 
 NAMES = ["apo-pf", "de-pf", "pf", "pso-pf", "reference"]
@@ -55,7 +56,7 @@ def test_every_particle_is_copied_as_often_as_it_should_be(scheme, w, u):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_resampling_is_unbiased(scheme):
-    w = normalised(np.random.default_rng(0).normal(size=(1, 9)) * 2)
+    w = normalise(np.random.default_rng(0).normal(size=(1, 9)) * 2)
     u = (np.arange(4000) + 0.5) / 4000
     chosen = SCHEMES[scheme](np.repeat(w, 4000, axis=0), u)
     copies = np.stack([(chosen == i).sum(axis=1) for i in range(9)]).mean(axis=1)
@@ -64,7 +65,7 @@ def test_resampling_is_unbiased(scheme):
 
 @given(st.lists(st.floats(-1e6, 0.0), min_size=2, max_size=30))
 def test_weights_sum_to_one_however_small_they_are(logs):
-    w = normalised(np.array([logs]) - 1e6)
+    w = normalise(np.array([logs]) - 1e6)
     assert w.sum() == pytest.approx(1.0)
     assert 1.0 - 1e-9 <= effective_size(w)[0] <= w.shape[1] + 1e-9
 
@@ -107,7 +108,7 @@ def test_a_generation_of_de_is_equations_3_to_7():
         v = [u[j] if chances[j] <= CR or j == int(2 * forced) else x[0, i, j] for j in (0, 1)]
         if np.exp(hill(np.array([[v]])))[0, 0] > f[i]:
             expected[0, i] = v
-    moved = evolve(Operators(), x, hill(x), 20, 1, hill, streams)
+    moved = DePf(generations=1).evolve(x, hill(x), 20, hill, streams)
     assert 5 < (expected != x).any(axis=2).sum() < 20
     np.testing.assert_allclose(moved, expected, atol=1e-9)
 
@@ -131,7 +132,7 @@ def test_evolution_climbs_and_leaves_the_others_alone(name):
 
 @pytest.mark.parametrize("name", ["de-pf", "pso-pf", "apo-pf"])
 def test_look_ups_are_counted(name, rough, monkeypatch):
-    scenario = simulate(rough, Plan(hours=2.05), Grade(), runs=range(2), seed=1)
+    scenario = simulate(rough, PlannedVoyage(hours=2.05), InsGrade(), runs=range(2), seed=1)
     points = 0
 
     def at(self, latitude, longitude):
@@ -156,7 +157,7 @@ def test_de_mc_leaves_a_gaussian_as_it_is():
 
     level, total = rate(x), []
     for _ in range(60):
-        x, level = metropolis(x, level, rate, streams)
+        x, level = de_mc_generation(x, level, rate, streams)
         total.append(x[0])
     pool = np.concatenate(total[10:])
     np.testing.assert_allclose(np.cov(pool.T), np.eye(2), atol=0.15)
@@ -185,8 +186,8 @@ def test_a_filter_beats_the_ins_and_not_the_bound(results, voyage, name):
 
 def test_strapped_down_biases_turn_with_the_heading_and_the_filter_knows(rough):
     """By the course of the indicated velocity, which errs by degrees, the normalised error squared is above 10."""
-    ins = Grade(mounting="strapdown")
-    scenario = simulate(rough, Plan(), ins, runs=range(6), seed=1, period=60.0)
+    ins = InsGrade(mounting="strapdown")
+    scenario = simulate(rough, PlannedVoyage(), ins, runs=range(6), seed=1, period=60.0)
     _, scores = run(scenario, "reference")
     assert scores.nees.mean() < 4.0
 
@@ -206,7 +207,7 @@ def test_the_claimed_spread_fits_the_error(results, name):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_plain_filter_is_far_better_than_the_ins(seed):
     scenario = simulate(
-        generate(PRESETS["rough"], seed), Plan(), Grade(), runs=range(6), seed=seed, period=10.0
+        generate(PRESETS["rough"], seed), PlannedVoyage(), InsGrade(), runs=range(6), seed=seed, period=10.0
     )
     _, scores = run(scenario, "pf", seed=seed)
     assert rmse(scores) < 600
@@ -228,9 +229,9 @@ def test_without_measurements_every_filter_drifts(voyage):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_run_alone_is_the_same_as_in_a_batch(voyage, rough, name):
     settings = {} if name in ("pf", "reference") else {"generations": 2}
-    plan = Plan(hours=2.5)
-    batch = simulate(rough, plan, Grade(), runs=range(4), seed=1)
-    alone = simulate(rough, plan, Grade(), runs=range(2, 3), seed=1)
+    plan = PlannedVoyage(hours=2.5)
+    batch = simulate(rough, plan, InsGrade(), runs=range(4), seed=1)
+    alone = simulate(rough, plan, InsGrade(), runs=range(2, 3), seed=1)
     assert (alone.measured[0] == batch.measured[2]).all()
     together, _ = run(batch, name, runs=range(4), **settings)
     single, _ = run(alone, name, runs=range(2, 3), **settings)
@@ -240,22 +241,27 @@ def test_a_run_alone_is_the_same_as_in_a_batch(voyage, rough, name):
 
 @pytest.mark.parametrize("name", ["de-pf", "pso-pf", "apo-pf"])
 def test_the_literal_mode_is_told_to_lose_lock(rough, name):
-    scenario = simulate(rough, Plan(), Grade(), runs=range(3), seed=1, period=60.0)
+    scenario = simulate(rough, PlannedVoyage(), InsGrade(), runs=range(3), seed=1, period=60.0)
     _, scores = run(scenario, name, runs=range(3), mode="literal", generations=10)
     assert scores.lost.any()
 
 
-@pytest.mark.parametrize("road", ["metropolis", "window", "safe"])
-def test_the_other_roads_beat_the_ins(rough, road):
-    scenario = simulate(rough, Plan(hours=4.0), Grade(), runs=range(3), seed=1, period=20.0)
-    _, scores = run(scenario, "de-pf", runs=range(3), road=road, generations=2)
+@pytest.mark.parametrize("strategy", ["metropolis", "window", "safe"])
+def test_the_other_strategies_beat_the_ins(rough, strategy):
+    scenario = simulate(rough, PlannedVoyage(hours=4.0), InsGrade(), runs=range(3), seed=1, period=20.0)
+    _, scores = run(scenario, "de-pf", runs=range(3), strategy=strategy, generations=2)
     assert rmse(scores) < 0.5 * np.sqrt(scores.ins.mean())
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_constant_map_leaves_the_cloud_wide(name):
     flat = simulate(
-        generate(PRESETS["constant"], 0), Plan(hours=3.5), Grade(), runs=range(3), seed=1, period=30.0
+        generate(PRESETS["constant"], 0),
+        PlannedVoyage(hours=3.5),
+        InsGrade(),
+        runs=range(3),
+        seed=1,
+        period=30.0,
     )
     settings = {} if name in ("pf", "reference") else {"generations": 3}
     track, _ = run(flat, name, runs=range(3), **settings)
@@ -265,21 +271,21 @@ def test_a_constant_map_leaves_the_cloud_wide(name):
 
 @pytest.mark.parametrize("settings", [{"resampling": "residual"}, {"state": 12, "particles": 1000}])
 def test_residual_resampling_and_twelve_states_beat_the_ins(rough, settings):
-    scenario = simulate(rough, Plan(hours=4.0), Grade(), runs=range(3), seed=1, period=20.0)
+    scenario = simulate(rough, PlannedVoyage(hours=4.0), InsGrade(), runs=range(3), seed=1, period=20.0)
     _, scores = run(scenario, "pf", runs=range(3), **settings)
     assert rmse(scores) < 0.5 * np.sqrt(scores.ins.mean())
 
 
-@pytest.mark.parametrize(("road", "idle"), [(road, name) for road, names in IDLE.items() for name in names])
-def test_a_setting_without_effect_on_its_road_is_refused(road, idle):
+@pytest.mark.parametrize(
+    ("strategy", "idle"), [(strategy, name) for strategy, names in IDLE.items() for name in names]
+)
+def test_a_setting_without_effect_on_its_strategy_is_refused(strategy, idle):
     other = {"resampling": "residual", "state": 12, "mutation": "rand-to-best", "window": 7}.get(idle, 0.75)
-    with pytest.raises(ConfigError, match=f"{idle}: has no effect on road {road}"):
-        FILTERS.build(
-            "de-pf", {"road": road, idle: 1.5 if idle in ("inflation", "swell") else other}, "de-pf"
-        )
+    with pytest.raises(ConfigError, match=f"{idle}: has no effect with strategy {strategy}"):
+        FILTERS.build("de-pf", {"strategy": strategy, idle: 1.5 if "inflation" in idle else other}, "de-pf")
 
 
 def test_settings_with_effect_are_taken():
-    FILTERS.build("de-pf", {"road": "safe", "fraction": 0.4, "weight_max": 0.7}, "de-pf")
-    FILTERS.build("de-pf", {"road": "window", "window": 4}, "de-pf")
+    FILTERS.build("de-pf", {"strategy": "safe", "fraction": 0.4, "weight_max": 0.7}, "de-pf")
+    FILTERS.build("de-pf", {"strategy": "window", "window": 4}, "de-pf")
     FILTERS.build("de-pf", {"mode": "literal", "mutation": "rand-to-best"}, "de-pf")

@@ -15,17 +15,17 @@ import pytest
 
 import accelcal_cli
 from accelcal_cli.errors import AccelcalError, DataError
-from accelcal_cli.navigation.gravity_map import PRESETS, Field, generate, load_map
-from accelcal_cli.navigation.ins import Grade
+from accelcal_cli.navigation.gravity_map import PRESETS, RandomField, generate, load_map
+from accelcal_cli.navigation.ins import InsGrade
 from accelcal_cli.navigation.particle_filter import FILTERS
-from accelcal_cli.navigation.scenario import read_voyage, recorded
-from accelcal_cli.navigation.study import Waters, load_waters
-from accelcal_cli.navigation.voyage import Plan
+from accelcal_cli.navigation.scenario import from_recording, read_voyage
+from accelcal_cli.navigation.study import NavigationSettings, load_study
+from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.table import Table
-from accelcal_cli.views.navigation import COLUMNS, beside
+from accelcal_cli.views.navigation import COLUMNS, with_paper
 
 ROOT = Path(accelcal_cli.__file__).parents[1]
-SMALL = Field(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0)
+SMALL = RandomField(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0)
 QUICK = """
 plan: {hours: 2.6, turn: 0, speed: 8}
 period: 30
@@ -232,7 +232,9 @@ def test_a_recorded_heading_turns_the_biases(tmp_path):
     degrees = ("heading", "350", "10", "10", "40")
     path.write_text("\n".join(f"{line},{cell}" for line, cell in zip(lines, degrees, strict=True)))
     flat = generate(PRESETS["constant"], 0)
-    found = recorded(read_voyage(str(path), 30.0), flat, Grade(), 1.0, 2000.0, range(1), 0)
+    found = from_recording(
+        read_voyage(str(path), 30.0), flat, InsGrade(), runs=range(1), seed=0, noise=1.0, initial=2000.0
+    )
     np.testing.assert_allclose(np.degrees(found.turns), [20.0, 0.0, 30.0], atol=1e-9)
 
 
@@ -372,7 +374,7 @@ def test_a_map_that_ends_inside_the_track_is_refused(tmp_path):
 
 
 def test_a_hole_in_the_map_near_the_track_is_refused(tmp_path, quick):
-    grid = generate(Field(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0), 0)
+    grid = generate(RandomField(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0), 0)
     holes = {(i, 60) for i in range(grid.values.shape[0])}
     path = write_xyz(tmp_path / "map.xyz", grid, holes)
     text = "plan: {hours: 4, turn: 0}\nperiod: 30\n"
@@ -387,17 +389,23 @@ def test_every_setting_of_a_filter_is_documented():
     for name in FILTERS.names():
         settings = {field.name for field in dataclasses.fields(FILTERS.get(name))}  # type: ignore[arg-type]
         assert settings <= told, name
-    for cls in (Waters, Plan, Grade):
-        assert {field.name for field in dataclasses.fields(cls)} - {"digests"} <= told
+    for cls in (NavigationSettings, PlannedVoyage, InsGrade):
+        assert {field.name for field in dataclasses.fields(cls)} - {
+            "digests",
+            "title",
+            "source",
+            "note",
+            "paper",
+        } <= told
     assert {column.key or column.name for column in COLUMNS} <= told
 
 
 def test_the_papers_numbers_stand_beside_ours():
-    study = load_waters("depf-rmse", {})
-    table = beside(
+    study = load_study("depf-rmse", {})
+    table = with_paper(
         Table("", COLUMNS, tuple([(name, *[None] * (len(COLUMNS) - 1)) for name in ("PSO-PF", "de-pf")])),
-        study[2],
+        study,
     )
     assert [row["paper_m"] for row in table.records()] == [370.7, 101.5]
-    assert study[2]["runs"] == 200
-    assert {entry.parameters.get("particles", 100) for entry in study[1]} == {100}
+    assert study.runs == 200
+    assert {entry.parameters.get("particles", 100) for entry in study.filters} == {100}

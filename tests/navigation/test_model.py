@@ -10,10 +10,10 @@ import scipy.linalg
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.navigation import ins as earth
 from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, generate
-from accelcal_cli.navigation.ins import Grade, Motion, discretise, dynamics, metric
+from accelcal_cli.navigation.ins import InsGrade, Motion, discretise, dynamics, to_metric
 from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import bound, counted
-from accelcal_cli.navigation.voyage import Plan, planned
+from accelcal_cli.navigation.voyage import PlannedVoyage
 
 
 def at_rest(latitude: float) -> Motion:
@@ -23,7 +23,7 @@ def at_rest(latitude: float) -> Motion:
 def test_normal_gravity_is_that_of_wgs84():
     for latitude in (0.0, 20.2, 45.0, 90.0):
         expected = boule.WGS84.normal_gravity((0.0, latitude, 0.0)) * 1e-5
-        assert earth.normal_gravity(np.array(np.radians(latitude))) == pytest.approx(expected, rel=1e-9)
+        assert earth.somigliana_gravity(np.array(np.radians(latitude))) == pytest.approx(expected, rel=1e-9)
 
 
 def test_radii_at_equator_and_pole():
@@ -57,7 +57,7 @@ def test_metric_states_are_metres():
     motion = Motion(*(np.array([v]) for v in (0.4, 7.5, -2.7, 0.0, 0.0)))
     F = discretise(dynamics(motion), 10.0)
     latitude = np.array([0.4])
-    M = metric(F, latitude, latitude)[0]
+    M = to_metric(F, latitude, latitude)[0]
     scale = np.array([v[0] for v in earth.metres_per_radian(latitude)] + [1.0] * 10)
     np.testing.assert_allclose(M, F[0] * scale[:, None] / scale[None, :], atol=1e-15)
     assert M[0, 3] == pytest.approx(10.0, rel=1e-3)  # a metre a second north for ten seconds
@@ -119,11 +119,11 @@ def test_the_ins_alone_drifts_like_the_papers(voyage):
 
 def test_the_drift_needs_a_fitting_ins(rough):
     with pytest.raises(DataError, match="drifts between"):
-        simulate(rough, Plan(), Grade(1e-3, 1e-6), runs=range(1), seed=0)
+        simulate(rough, PlannedVoyage(), InsGrade(1e-3, 1e-6), runs=range(1), seed=0)
 
 
 def test_the_voyage_turns_and_stays_on_its_speed():
-    route = planned(Plan())
+    route = PlannedVoyage().trajectory()
     meridian, parallel = earth.metres_per_radian(route.latitude)
     speed = np.hypot(np.gradient(route.latitude) * meridian, np.gradient(route.longitude) * parallel)
     np.testing.assert_allclose(speed[5:-5], 8.0, rtol=1e-3)
@@ -133,16 +133,18 @@ def test_the_voyage_turns_and_stays_on_its_speed():
 
 def test_a_plan_out_of_range_is_refused():
     with pytest.raises(ConfigError, match="filtered"):
-        Plan(hours=1.0)
+        PlannedVoyage(hours=1.0)
     with pytest.raises(ConfigError, match="accelerometer"):
-        Grade(accelerometer=-1.0)
+        InsGrade(accelerometer=-1.0)
 
 
 def test_the_bound_falls_with_information(voyage, rough):
     least = bound(voyage)
     late = counted(voyage)
     assert 50 < np.sqrt(least[late].sum(axis=1).mean()) < 250
-    flat = simulate(generate(PRESETS["constant"], 0), Plan(), Grade(), runs=range(1), seed=1, period=30.0)
+    flat = simulate(
+        generate(PRESETS["constant"], 0), PlannedVoyage(), InsGrade(), runs=range(1), seed=1, period=30.0
+    )
     assert np.sqrt(bound(flat)[-1].sum()) > 3000  # nothing to see: the bound is the INS itself
-    louder = simulate(rough, Plan(), Grade(), runs=range(1), seed=1, period=30.0, noise=5.0)
+    louder = simulate(rough, PlannedVoyage(), InsGrade(), runs=range(1), seed=1, period=30.0, noise=5.0)
     assert (bound(louder)[late].sum(axis=1) > least[late].sum(axis=1)).all()

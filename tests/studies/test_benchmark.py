@@ -10,10 +10,10 @@ from scipy import stats
 
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.studies import benchmark as ranks
-from accelcal_cli.studies.benchmark import Benchmark, curves, summary
+from accelcal_cli.studies.benchmark import Benchmark, statistics
 from accelcal_cli.studies.engine import Journal, run_study
-from accelcal_cli.studies.entries import Budget, choose, words
-from accelcal_cli.studies.study import Record, Task, median_curve, raw_table
+from accelcal_cli.studies.study import Budget, Record, Task, choose, median_curve, median_curves, words
+from accelcal_cli.views.studies import ranking_table, raw_table
 
 SMALL = {"population": 20, "iterations": 30}
 CONTRACT = {
@@ -24,7 +24,7 @@ CONTRACT = {
 
 def study(functions=("sphere", "rosenbrock"), optimizers=("pso", "de"), **changes):
     budget = Budget(**SMALL)
-    changes = {"dimensions": 3, "repeats": 7, "tolerance": 1e-2, **changes}
+    changes = {"dimensions": 3, "runs": 7, "tolerance": 1e-2, **changes}
     return Benchmark(tuple(functions), tuple(choose(optimizers, None, (), budget)), **changes)
 
 
@@ -39,7 +39,7 @@ def record(cell, run, cost, hit=None, curve=(), status="iterations", seconds=0.1
 
 
 def test_rows_have_the_names_of_the_contract(done):
-    rows = summary(*done).records()
+    rows = statistics(*done)
     assert [(r["function"], r["optimizer"]) for r in rows] == [
         ("sphere", "pso"), ("sphere", "de"), ("rosenbrock", "pso"), ("rosenbrock", "de"),
     ]  # fmt: skip
@@ -48,7 +48,7 @@ def test_rows_have_the_names_of_the_contract(done):
 
 def test_statistics_are_those_of_the_runs(done):
     small, records = done
-    for cell, row in enumerate(summary(small, records).records()):
+    for cell, row in enumerate(statistics(small, records)):
         own = [r for r in records if r.cell == cell]
         cost = [r.cost for r in own]
         assert row["runs"] == len(own) == 7
@@ -73,7 +73,7 @@ def test_hits_are_evaluations_until_the_tolerance(done):
 
 
 def test_one_run_has_no_variance_and_no_hits_no_evaluations_to_tolerance():
-    (row,) = summary(study(("sphere",), ("pso",), repeats=1), [record(0, 0, 3.0)]).records()
+    (row,) = statistics(study(("sphere",), ("pso",), runs=1), [record(0, 0, 3.0)])
     assert row["variance"] is None
     assert row["evaluations_to_tolerance"] is None
     assert row["success_rate"] == 0
@@ -81,7 +81,7 @@ def test_one_run_has_no_variance_and_no_hits_no_evaluations_to_tolerance():
 
 def test_a_run_without_a_cost_is_infinite_and_a_failure():
     records = [record(0, 0, 1.0), record(0, 1, math.inf, status="failed")]
-    (row,) = summary(study(("sphere",), ("pso",), repeats=2), records).records()
+    (row,) = statistics(study(("sphere",), ("pso",), runs=2), records)
     assert (row["min"], row["mean"], row["variance"], row["failures"]) == (1.0, math.inf, None, 1)
 
 
@@ -109,7 +109,7 @@ def test_the_median_curve_keeps_the_cost_of_a_run_that_ended():
 
 
 def test_curves_are_named_and_fall(done):
-    found = curves(*done)
+    found = median_curves(*done)
     assert list(found) == ["sphere", "rosenbrock"]
     for panel in found.values():
         assert list(panel) == ["pso", "de"]
@@ -131,7 +131,7 @@ def test_least_squares_takes_part_where_there_are_squares():
 
 def test_levenberg_marquardt_solves_sums_of_squares():
     small = Benchmark(("sphere", "zakharov", "elliptic"), tuple(choose(["levenberg-marquardt"], None, (), Budget())),
-                      dimensions=4, repeats=3, shift=True, rotate=True)  # fmt: skip
+                      dimensions=4, runs=3, shift=True, rotate=True)  # fmt: skip
     assert all(r.cost < 1e-12 for r in run_study(small, Journal(None)))
 
 
@@ -141,7 +141,7 @@ def test_levenberg_marquardt_solves_sums_of_squares():
 def test_a_budget_of_evaluations_is_used_by_all():
     budget = Budget(evaluations=3000)
     small = Benchmark(("rastrigin",), tuple(choose(["pso", "de", "ifoa", "shade-cma"], None, (), budget)),
-                      dimensions=4, repeats=2, evaluations=3000)  # fmt: skip
+                      dimensions=4, runs=2, evaluations=3000)  # fmt: skip
     for r in run_study(small, Journal(None)):
         assert 2900 <= r.evaluations <= 3200
 
@@ -220,4 +220,4 @@ def test_ranks_need_two_of_either_and_leave_out_who_missed_a_function(done):
     assert ranks.rank(study(("sphere",)), records[:14]) is None
     mixed = study(("sphere", "ackley"), ("pso", "levenberg-marquardt"))
     assert ranks.rank(mixed, run_study(mixed, Journal(None))) is None
-    assert "Nemenyi" in " ".join(ranks.table(ranks.rank(small, records)).notes)
+    assert "Nemenyi" in " ".join(ranking_table(ranks.rank(small, records)).notes)

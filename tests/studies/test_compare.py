@@ -12,19 +12,19 @@ from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.sensor.simulation import draw, load_sensor
-from accelcal_cli.studies.compare import Comparison, curves, succeeded, summary
+from accelcal_cli.studies.compare import Comparison, statistics, succeeded
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.scenarios import (
     BoxSettings,
     Recording,
-    Search,
+    SearchSpace,
     Simulation,
-    errors,
     in_lower,
-    limit,
-    starting_points,
+    parameter_errors,
+    success_limit,
 )
-from accelcal_cli.studies.study import Entry
+from accelcal_cli.studies.study import Entry, median_curves
+from accelcal_cli.views.experiments import comparison_table
 
 G = 9.80665
 CONTRACT = {
@@ -37,13 +37,13 @@ DE = Entry("de", "de", {"population": 40, "iterations": 300})
 
 def comparison(*entries, noise=0.001, positions=12, drawn=True, sensor="mems", unknowns=9, **changes):
     source = Simulation(load_sensor(sensor), drawn, positions, None, noise)
-    changes = {"repeats": 6, **changes}
-    return Comparison(source, Search(G, unknowns), entries or (LM,), **changes)
+    changes = {"runs": 6, **changes}
+    return Comparison(source, SearchSpace(G, unknowns), entries or (LM,), **changes)
 
 
 def result(study):
     records = run_study(study, Journal(None))
-    return summary(study, records).records(), records
+    return statistics(study, records), records
 
 
 # Scenes
@@ -52,7 +52,7 @@ def result(study):
 @pytest.mark.parametrize("unknowns", [9, 12])
 def test_a_run_is_the_same_in_any_company(unknowns):
     study = comparison(unknowns=unknowns)
-    together, alone = study.scene(range(20)), study.scene([13])
+    together, alone = study.calibrations(range(20)), study.calibrations([13])
     np.testing.assert_array_equal(together.truth.K[13:14], alone.truth.K)
     np.testing.assert_array_equal(together.problem.box.centre[13:14], alone.problem.box.centre)
     np.testing.assert_array_equal(together.problem.triangle.R[13:14], alone.problem.triangle.R)
@@ -73,31 +73,31 @@ def test_sensors_differ_by_the_spread_of_their_type():
 
 @pytest.mark.parametrize("noise", [0.0, 0.0124])
 def test_the_box_holds_the_least_cost_well_inside(noise):
-    study = comparison(noise=noise, repeats=40)
-    scene = study.scene(range(40))
-    assert np.abs(scene.problem.coordinates(scene.truth.K, scene.truth.D)).max() < 0.9
+    study = comparison(noise=noise, runs=40)
+    block = study.calibrations(range(40))
+    assert np.abs(block.problem.coordinates(block.truth.K, block.truth.D)).max() < 0.9
     floor = 3 * (2 * G * noise) ** 2  # (J - 9) (2 g sigma)^2
-    assert scene.least.mean() == pytest.approx(floor, rel=0.5, abs=1e-20)
+    assert block.least.mean() == pytest.approx(floor, rel=0.5, abs=1e-20)
 
 
 def test_the_fixed_sensor_is_the_configured_one():
     sensor = load_sensor("dpso")
-    truth = comparison(sensor="dpso", drawn=False).scene(range(2)).truth
+    truth = comparison(sensor="dpso", drawn=False).calibrations(range(2)).truth
     np.testing.assert_allclose(truth.K @ truth.K.swapaxes(1, 2), [sensor.model.K @ sensor.model.K.T] * 2)
     np.testing.assert_array_equal(truth.D, [sensor.D_a] * 2)
 
 
 def test_starting_points_lie_in_their_own_box_and_may_leave_the_search_box():
-    space = Search(G, 9, BoxSettings(0.01, 0.01, 0.01), 1650.0, BoxSettings(0.1, 0.05, 0.02))
+    space = SearchSpace(G, 9, BoxSettings(0.01, 0.01, 0.01), 1650.0, BoxSettings(0.1, 0.05, 0.02))
     study = dataclasses.replace(comparison(), space=space)
-    scene = study.scene(range(3))
-    x = starting_points(scene, space, 50, range(3), seed=0)
-    theta = scene.problem.box.centre[:, None] + scene.problem.box.half[:, None] * x
+    block = study.calibrations(range(3))
+    x = space.starting_points(block.problem.box, 50, range(3), seed=0)
+    theta = block.problem.box.centre[:, None] + block.problem.box.half[:, None] * x
     middle = pack(1650.0 * np.eye(3), np.zeros(3), 9)
     half = np.repeat([165.0, 82.5, 0.02 * G * 1650.0], 3)
     assert (np.abs(theta - middle) <= half * (1 + 1e-12)).all()
     assert (np.abs(theta - middle).max(axis=(0, 1)) > 0.9 * half).all()
-    alone = starting_points(study.scene([2]), space, 50, [2], seed=0)
+    alone = space.starting_points(study.calibrations([2]).problem.box, 50, [2], seed=0)
     np.testing.assert_array_equal(alone, x[2:])
 
 
@@ -124,7 +124,9 @@ def test_readings_that_determine_no_sensor_are_refused():
     """Three poses, each eight times: a valley of sensors fits, and the search ends where it will."""
     u = np.repeat(np.array([[1.0, 0, 0], [0, 0.6, 0.8], [-0.6, 0.8, 0]]), 8, axis=0)
     rows = G * u + 1e-3 * np.random.default_rng(1).normal(size=u.shape)
-    with pytest.raises(DataError, match=r"no one least cost .* undetermined \(The poses do not determine: "):
+    with pytest.raises(
+        DataError, match=r"no unique least cost .* undetermined \(The poses do not determine: "
+    ):
         Recording.of(Readings.from_array(rows), G)
 
 
@@ -132,15 +134,17 @@ def test_readings_that_determine_no_sensor_are_refused():
 
 
 def test_errors_are_those_that_were_put_in():
-    scene = comparison().scene(range(4))
-    K, D = scene.truth.K.copy(), scene.truth.D.copy()
-    scale = np.einsum("rii->ri", scene.truth.K)
-    assert all(np.allclose(v, 0) for v in errors(K, D, scene, 0.001).values())
-    np.testing.assert_allclose(errors(K, D + scale * 1e-3 * G, scene, 0)["bias_error"], 1000, rtol=1e-9)
-    np.testing.assert_allclose(errors(K * (1 + 2e-6), D, scene, 0)["scale_error"], 2, rtol=1e-6)
+    block = comparison().calibrations(range(4))
+    K, D = block.truth.K.copy(), block.truth.D.copy()
+    scale = np.einsum("rii->ri", block.truth.K)
+    assert all(np.allclose(v, 0) for v in parameter_errors(K, D, block, 0.001).values())
+    np.testing.assert_allclose(
+        parameter_errors(K, D + scale * 1e-3 * G, block, 0)["bias_error"], 1000, rtol=1e-9
+    )
+    np.testing.assert_allclose(parameter_errors(K * (1 + 2e-6), D, block, 0)["scale_error"], 2, rtol=1e-6)
     K[:, 2, 1] += scale[:, 2] * np.radians(1 / 3600)
     np.testing.assert_allclose(
-        errors(K, D, scene, 0)["misalignment_error"], 1 / np.sqrt(3), rtol=1e-6
+        parameter_errors(K, D, block, 0)["misalignment_error"], 1 / np.sqrt(3), rtol=1e-6
     )  # rms over three angles
 
 
@@ -157,13 +161,13 @@ def test_any_matrix_comes_to_gauge_lower():
 
 
 def test_success_is_the_larger_of_the_tolerance_and_one_percent():
-    np.testing.assert_allclose(limit(np.array([0.0, 1.0]), 1e-10), [1e-10, 1.01])
+    np.testing.assert_allclose(success_limit(np.array([0.0, 1.0]), 1e-10), [1e-10, 1.01])
 
 
 @pytest.mark.parametrize(("unknowns", "positions"), [(9, 12), (12, 24), (9, 50)])
 def test_least_squares_is_as_good_as_the_bound_allows(unknowns, positions):
     """The mean of chi-square over nine: 1, give or take 1 / sqrt(2 * 9 * runs) = 1.2 %."""
-    (row,), _ = result(comparison(unknowns=unknowns, positions=positions, repeats=400))
+    (row,), _ = result(comparison(unknowns=unknowns, positions=positions, runs=400))
     assert row["success_rate"] == 1
     assert row["efficiency"] == pytest.approx(1.0, abs=0.04)
 
@@ -179,7 +183,7 @@ def test_rows_have_the_names_of_the_contract():
     assert rows[0]["bias_error"] == pytest.approx(
         np.sqrt(np.mean([r.values["bias_error"] ** 2 for r in records if r.cell == 0]))
     )
-    assert set(curves(comparison(LM, DE), records)) == {"lm", "de"}
+    assert set(median_curves(comparison(LM, DE), records)[""]) == {"lm", "de"}
 
 
 def test_without_noise_there_is_no_efficiency_and_the_errors_vanish():
@@ -196,7 +200,7 @@ def test_a_search_that_stalls_is_counted_and_the_polish_mends_it():
     assert row["success_rate"] == 0
     assert row["excess"] > 1
     assert row["efficiency"] > 3
-    table = summary(comparison(stalled), records)
+    table = comparison_table(comparison(stalled), records)
     assert any("foa came within 1 %" in note for note in table.notes)
     (row,), _ = result(comparison(stalled, polish=True))
     assert row["success_rate"] == 1
@@ -208,7 +212,7 @@ def test_the_least_cost_is_the_least_that_anything_found():
     study = comparison(LM, DE)
     records = run_study(study, Journal(None))
     low = [dataclasses.replace(r, cost=0.5 * r.values["least_cost"]) if r.cell else r for r in records]
-    lm, de = summary(study, low).records()
+    lm, de = statistics(study, low)
     assert (lm["success_rate"], de["success_rate"]) == (0, 1)
     assert lm["excess"] == pytest.approx(1.0, rel=1e-6)
     assert de["excess"] == 0
@@ -216,18 +220,18 @@ def test_the_least_cost_is_the_least_that_anything_found():
 
 
 def test_the_successful_runs_can_be_seen_alone():
-    study = comparison(Entry("de", "de", {"population": 20, "iterations": 150}), repeats=20, tolerance=0.0)
+    study = comparison(Entry("de", "de", {"population": 20, "iterations": 150}), runs=20, tolerance=0.0)
     records = run_study(study, Journal(None))
     good = [r for r in records if succeeded(study, r)]
     assert 0 < len(good) < 20
-    (row,) = summary(study, records, only_successful=True).records()
+    (row,) = statistics(study, records, only_successful=True)
     assert row["cost"] == np.median([r.cost for r in good])
     assert row["success_rate"] == len(good) / 20
 
 
 def test_a_run_that_failed_leaves_no_number_that_is_none():
-    far = Search(G, 9, BoxSettings(0.9, 0.7, 10), 1668.0, BoxSettings(0.18, 0.18, 0.02))
-    study = dataclasses.replace(comparison(Entry("newton", "newton", {}), repeats=20), space=far)
+    far = SearchSpace(G, 9, BoxSettings(0.9, 0.7, 10), 1668.0, BoxSettings(0.18, 0.18, 0.02))
+    study = dataclasses.replace(comparison(Entry("newton", "newton", {}), runs=20), space=far)
     rows, records = result(study)
     assert 0 < rows[0]["success_rate"] < 1
     assert all(v is None or np.isfinite(v) for r in records for v in r.values.values())
@@ -254,7 +258,7 @@ def test_every_optimizer_on_a_real_recording(shared_data):
         "akpso": {"iterations": 250},
     }
     entries = tuple(Entry(name, name, parameters.get(name, {})) for name in OPTIMIZERS.names())
-    study = Comparison(Recording.of(readings, 9.81744), Search(9.81744), entries, repeats=2)
+    study = Comparison(Recording.of(readings, 9.81744), SearchSpace(9.81744), entries, runs=2)
     rows, records = result(study)
     independent = 1.40796808e-2  # another solver's
     assert all(r.values["least_cost"] == pytest.approx(independent, rel=1e-6) for r in records)
@@ -267,6 +271,6 @@ def test_every_optimizer_on_a_real_recording(shared_data):
         assert row["efficiency"] is None
     assert all(not OPTIMIZERS.get(name).converges for name in CANNOT)
     assert min(by_name[name]["excess"] for name in CANNOT) > 10
-    notes = " ".join(summary(study, records).notes)
+    notes = " ".join(comparison_table(study, records).notes)
     assert all(f"{name} came within 1 % of the least cost in 0%" in notes for name in CANNOT)
     assert by_name["levenberg-marquardt"]["bias_error"] < 1e-3

@@ -21,7 +21,8 @@ from accelcal_cli.output.machine import write_table
 from accelcal_cli.studies import engine, pools
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.engine import Journal, run_study
-from accelcal_cli.studies.study import Entry, Task, raw_table
+from accelcal_cli.studies.study import Entry, Task
+from accelcal_cli.views.studies import raw_table
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"population": 10, "iterations": 20}
@@ -29,7 +30,7 @@ STUDY = Benchmark(
     ("sphere", "rosenbrock"),
     (Entry("pso", "pso", SMALL), Entry("de", "de", SMALL)),
     dimensions=3,
-    repeats=12,
+    runs=12,
     tolerance=1e-2,
 )
 LINE = (

@@ -10,7 +10,7 @@ from accelcal_cli.studies.functions import FUNCTIONS, PAPER, TestFunction, selec
 
 D = 5
 VARIANTS = [{}, {"shift": True}, {"rotate": True}, {"shift": True, "rotate": True}]
-SQUARES = [name for name, definition in FUNCTIONS.items() if definition.squares]
+SQUARES = [name for name, definition in FUNCTIONS.items() if definition.residuals]
 
 
 def at(problem, point):
@@ -99,7 +99,7 @@ def test_only_sums_of_squares_have_residuals():
     assert {"sphere", "rosenbrock", "modified-rosenbrock", "zakharov"} <= set(SQUARES)
     problem = TestFunction("ackley", D)
     assert not problem.has_residuals
-    with pytest.raises(NotImplementedError, match="no sum of squares"):
+    with pytest.raises(NotImplementedError, match="not a sum of squares"):
         problem.residuals(np.zeros((1, 1, D)))
 
 

@@ -9,11 +9,13 @@ import pytest
 
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.studies import reproduce
-from accelcal_cli.studies.compare import parameters, valley
+from accelcal_cli.studies.compare import error_parts, estimates
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.reproduce import PaperTable, Part
-from accelcal_cli.studies.study import Entry, Task, raw_table
+from accelcal_cli.studies.study import Entry, Task
 from accelcal_cli.table import Column, Table
+from accelcal_cli.views.experiments import experiment_tables, parameter_table, with_paper_rows
+from accelcal_cli.views.studies import raw_table
 
 NAMES = [
     "akpso-calibration", "dpso-figure2", "dpso-table2", "dpso-table3", "ifoa-calibration", "ifoa-rosenbrock",
@@ -31,8 +33,8 @@ def reduced(name, runs, labels, part=0):
 
 def rows_of(experiment):
     """Return the records of the summary by label: ours alone."""
-    records = run_study(experiment.study(), Journal(None))
-    tables = [table.records() for table in reproduce.tables(experiment, records)]
+    records = run_study(experiment, Journal(None))
+    tables = [table.records() for table in experiment_tables(experiment, records)]
     summary = next(rows for rows in tables if "success_rate" in rows[0])
     return {row["optimizer"]: row for row in summary if row.get("from", "here") == "here"}, records
 
@@ -42,15 +44,15 @@ def rows_of(experiment):
 
 def test_every_experiment_of_the_papers_is_there():
     assert reproduce.names() == NAMES
-    assert reproduce.voyages() == ["depf-rmse", "depf-roads"]
-    assert [row[0] for row in reproduce.catalogue().rows] == sorted([*NAMES, *reproduce.voyages()])
+    assert reproduce.navigation_names() == ["depf-rmse", "depf-strategies"]
+    assert [row[0] for row in reproduce.catalogue()] == sorted([*NAMES, *reproduce.navigation_names()])
 
 
 def test_names_look_into_every_file_once(monkeypatch):
     read, load = [], reproduce.load_mapping
     monkeypatch.setattr(reproduce, "load_mapping", lambda path: read.append(path) or load(path))
     reproduce.names()
-    assert len(read) == len(set(read)) == len(NAMES) + len(reproduce.voyages())
+    assert len(read) == len(set(read)) == len(NAMES) + len(reproduce.navigation_names())
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -58,7 +60,7 @@ def test_every_experiment_builds_its_studies(name):
     experiment = reproduce.load(name)
     assert experiment.name == name
     assert "[" in experiment.source
-    study = experiment.study()
+    study = experiment
     assert study.cells == sum(part.study().cells for part in experiment.parts)
     for part in experiment.parts:
         for entry in part.optimizers:
@@ -88,7 +90,7 @@ def test_runs_and_seed_can_be_changed():
 
 def test_parts_number_their_cells_through():
     experiment = reproduce.load("ifoa-calibration").changed(2, None)
-    study = experiment.study()
+    study = experiment
     first, second, third = experiment.parts
     last = len(first.optimizers) + len(second.optimizers) - 1
     assert study.cells == last + 1 + len(third.optimizers)
@@ -106,7 +108,7 @@ def test_parts_number_their_cells_through():
 
 def test_raw_results_name_part_function_and_optimizer():
     experiment = reduced("dpso-figure2", 1, ["PSO"])
-    table = raw_table(experiment.study(), run_study(experiment.study(), Journal(None)))
+    table = raw_table(experiment, run_study(experiment, Journal(None)))
     row = table.records()[0]
     assert (row["part"], row["function"], row["optimizer"]) == ("Figure 2", "calibration", "PSO")
     assert {"cost", "K_11", "D_3", "bias_error"} <= set(row)
@@ -115,10 +117,10 @@ def test_raw_results_name_part_function_and_optimizer():
 def test_the_papers_rows_stand_under_ours():
     ours = Table("", (Column("optimizer"), Column("time", key="seconds")), (("a", 1.0), ("b", 2.0)))
     paper = PaperTable(("optimizer", "seconds"), (("b", 8.0), ("c", 9.0)))
-    table = reproduce.beside(ours, paper)
+    table = with_paper_rows(ours, paper)
     assert [c.name for c in table.columns] == ["optimizer", "from", "time"]
     assert table.rows == (("a", "here", 1.0), ("b", "here", 2.0), ("b", "paper", 8.0))
-    assert reproduce.beside(ours, None) is ours
+    assert with_paper_rows(ours, None) is ours
 
 
 # What has to hold
@@ -126,7 +128,7 @@ def test_the_papers_rows_stand_under_ours():
 
 def test_shade_cma_betters_every_row_of_dpso_table_2():
     experiment = reduced("dpso-table2", 6, ["SHADE-CMA"])
-    (table,) = reproduce.tables(experiment, run_study(experiment.study(), Journal(None)))
+    (table,) = experiment_tables(experiment, run_study(experiment, Journal(None)))
     rows = {row["function"]: row for row in table.records()}
     assert max(row["evaluations"] for row in rows.values()) <= 50_000
     assert rows["sphere"]["mean"] <= 3.8e-111
@@ -138,8 +140,8 @@ def test_shade_cma_betters_every_row_of_dpso_table_2():
 def test_dpso_table_2_is_not_reached_by_the_printed_settings():
     """The documentation says so: if a change makes it untrue, it has to say something else."""
     experiment = reduced("dpso-table2", 5, ["DE-PSO", "PSO"])
-    records = run_study(experiment.study(), Journal(None))
-    (table,) = reproduce.tables(experiment, records)
+    records = run_study(experiment, Journal(None))
+    (table,) = experiment_tables(experiment, records)
     ours = {(r["function"], r["optimizer"]): r["median"] for r in table.records() if r["from"] == "here"}
     paper = {(r["function"], r["optimizer"]): r["mean"] for r in table.records() if r["from"] == "paper"}
     assert set(ours) == set(paper)
@@ -159,7 +161,8 @@ def test_table_3_tells_the_rotation_from_what_the_readings_show():
     experiment = reduced("dpso-table3", 3, ["DE-PSO"])
     part = experiment.parts[0]
     records = run_study(part.study(), Journal(None))
-    rows = {row["estimate"]: row for row in valley(part.study(), records, part.printed).records()}
+    named = estimates(part.study(), records, part.printed)
+    rows = {row["estimate"]: row for row in error_parts(part.study(), named)}
     assert rows["truth"]["cost"] < 1e-24
     assert rows["DE-PSO"]["rotation"] > 10
     assert max(rows["DE-PSO"][k] for k in ("misalignments", "scale_factors", "bias")) < 1e-6
@@ -168,10 +171,10 @@ def test_table_3_tells_the_rotation_from_what_the_readings_show():
     assert paper[0]["misalignments"] < 0.1 * paper[1]["misalignments"]
     assert paper[0]["cost"] < 0.02 * paper[1]["cost"]  # the specification's 1.4e-8 and 1.2e-6
     assert paper[0]["cost"] == pytest.approx(1.4e-8, rel=0.05)
-    estimates = {row["parameter"]: row for row in parameters(part.study(), records, part.printed).records()}
-    assert estimates["K_13"]["truth"] == -692.85
-    assert estimates["D_2"]["paper DE"] == 11722.8
-    assert estimates["D_2"]["DE-PSO"] == pytest.approx(11723, abs=1e-6)
+    parameters = {row["parameter"]: row for row in parameter_table(named).records()}
+    assert parameters["K_13"]["truth"] == -692.85
+    assert parameters["D_2"]["paper DE"] == 11722.8
+    assert parameters["D_2"]["DE-PSO"] == pytest.approx(11723, abs=1e-6)
 
 
 def test_ifoa_on_the_modified_rosenbrock_function():
@@ -189,7 +192,7 @@ def test_ifoa_calibrates_and_a_fixed_radius_does_not():
     assert 20_000 < rows["IFOA"]["evaluations"] < 28_000  # ten a generation
     assert 0.55 <= rows["Newton"]["success_rate"] <= 0.9
     assert rows["Levenberg-Marquardt"]["success_rate"] == 1
-    alone = reproduce.tables(reduced("ifoa-calibration", 40, labels), records)[1].records()
+    alone = experiment_tables(reduced("ifoa-calibration", 40, labels), records)[1].records()
     assert alone[0]["cost"] < alone[1]["cost"]  # Newton, where it succeeds, ends below IFOA
     fixed = reduced("ifoa-calibration", 10, ["fixed radius"])
     entry = dataclasses.replace(fixed.parts[0].optimizers[0], parameters={"population": 10, "radius": 1e4})
@@ -218,7 +221,7 @@ def test_fading_hurts_and_kpso_stays_on_its_floor():
     rows, records = rows_of(experiment)
     assert rows["AKPSO 4-state"]["cost"] < 1e-3 * rows["AKPSO fading 1"]["cost"]
     assert rows["KPSO"]["cost"] > 1e-3
-    table = reproduce.tables(experiment, records)[1]
+    table = experiment_tables(experiment, records)[1]
     row = next(r for r in table.rows if r[0] == "KPSO")
     assert len(row) == len(reproduce.CHECKPOINTS) + 1
     assert list(row[2:]) == sorted(row[2:], reverse=True)
@@ -226,7 +229,7 @@ def test_fading_hurts_and_kpso_stays_on_its_floor():
 
 def test_curves_are_those_of_the_parts_that_show_them():
     experiment = reduced("dpso-table3", 1, ["PSO"])
-    records = run_study(experiment.study(), Journal(None))
+    records = run_study(experiment, Journal(None))
     assert reproduce.curves(experiment, records, shown=True) == {}
     ((title, panel),) = reproduce.curves(experiment, records).items()
     assert title == experiment.parts[0].title

@@ -1,1 +1,1 @@
-"""The optimizers, one a file, found by name."""
+"""The optimizers, one per file, found by name."""

@@ -14,11 +14,11 @@ from accelcal_cli.arrays import Float, Int
 from accelcal_cli.optimization.operators import (
     best_of,
     better_of,
+    clip,
     gather,
     integers,
     mutated_genes,
     partners,
-    press,
 )
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.optimization.problem import Problem
@@ -56,7 +56,7 @@ class DifferentialEvolution(Optimizer[State]):
         trial = self._change(x, fx, picks)
         trial *= mutated  # [dpso2014] eq. 5
         trial += x
-        press(trial, *problem.limits)
+        clip(trial, *problem.limits)
         return State(*better_of(x, fx, trial, problem.cost(trial)))  # [dpso2014] eq. 6
 
     def _choices(self, u: Float) -> tuple[Int, Float]:

@@ -17,11 +17,11 @@ from accelcal_cli.optimization.algorithms.pso import velocity
 from accelcal_cli.optimization.operators import (
     best_of,
     better_of,
+    clip,
     gather,
     integers,
     mutated_genes,
     partners,
-    press,
 )
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.optimization.problem import Problem
@@ -87,13 +87,13 @@ class HybridSwarm(Optimizer[HybridState]):
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
         v = self._velocity(state, r1[:, :half], r2[:, :half], curve)
-        press(v, -limit, limit)
+        clip(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
         individuals = state.memory[:, half:].copy(order="K")
         change = self._change(individuals, state.leader, picks, curve)
         change *= mutated  # [dpso2014] eq. 5
         np.add(individuals, change, out=x[:, half:])
-        press(x, low, high)
+        clip(x, low, high)
         return x, v
 
     def _choices(self, u: Float) -> tuple[Float, Float, Int, Float]:

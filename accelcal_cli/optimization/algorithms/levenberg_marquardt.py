@@ -64,24 +64,21 @@ class LevenbergMarquardt(Optimizer[DampedState]):
     def step(self, problem: Problem, state: DampedState, rng: Streams) -> DampedState:
         """Try one damped step at every point; keep it where the cost falls."""
         x, fx = state.x, state.fx
-        held = ((x <= problem.lower) & (state.gradient > 0)) | ((x >= problem.upper) & (state.gradient < 0))
-        delta, usable = _solve(state, held)
+        on_wall = ((x <= problem.lower) & (state.gradient > 0)) | (
+            (x >= problem.upper) & (state.gradient < 0)
+        )
+        delta, usable = _solve(state, on_wall)
         trial = np.clip(x + delta, problem.lower, problem.upper)
         r = problem.residuals(trial)
         trial_cost = np.einsum("rpm,rpm->rp", r, r)
-        moved = trial - x
-        predicted = -np.einsum("rpd,rpd->rp", moved, 2.0 * state.gradient) - np.einsum(
-            "rpd,rpde,rpe->rp", moved, state.normal, moved
-        )
-        better = trial_cost < fx
-        gain = np.where(
-            better & (predicted > 0), (fx - trial_cost) / np.where(predicted > 0, predicted, 1.0), 0.0
-        )
+        better, move = trial_cost < fx, trial - x
         x = np.where(better[..., None], trial, x)
         r = np.where(better[..., None], r, state.residuals)
         normal, gradient = _normal_equations(problem, x, r)
-        small = np.abs(moved).max(axis=2) <= self.step_tolerance * (problem.upper - problem.lower).max()
+        small = np.abs(move).max(axis=2) <= self.step_tolerance * (problem.upper - problem.lower).max()
         done = (small | (trial_cost == 0) | (state.damping > 1e30)).all(axis=1)
+        gain = _gain(state, move, np.where(better, fx - trial_cost, 0.0))
+        shrink = np.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
         fx = np.where(better, trial_cost, fx)
         status = _status(fx)
         status[done & (status == Status.RUNNING)] = Status.CONVERGED
@@ -93,11 +90,23 @@ class LevenbergMarquardt(Optimizer[DampedState]):
             residuals=r,
             normal=normal,
             gradient=gradient,
-            damping=state.damping
-            * np.where(better, np.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.growth),
+            damping=state.damping * np.where(better, shrink, state.growth),
             growth=np.where(better, 2.0, 2.0 * state.growth),
             status=status,
         )
+
+
+def _gain(state: DampedState, move: Float, fall: Float) -> Float:
+    """Return the fall of the cost over the one that the linearisation predicts, shape (R, P); 0 where it predicts none.
+
+    Args:
+        state: before the move, of shape (R, P, D).
+        move: to the trial; fall: of the cost, shape (R, P).
+    """
+    predicted = -np.einsum("rpd,rpd->rp", move, 2.0 * state.gradient) - np.einsum(
+        "rpd,rpde,rpe->rp", move, state.normal, move
+    )
+    return np.where(predicted > 0, fall / np.where(predicted > 0, predicted, 1.0), 0.0)
 
 
 def _normal_equations(problem: Problem, x: Float, r: Float) -> tuple[Float, Float]:
@@ -107,25 +116,25 @@ def _normal_equations(problem: Problem, x: Float, r: Float) -> tuple[Float, Floa
     return transposed @ jacobian, (transposed @ r[..., None])[..., 0]
 
 
-def _solve(state: DampedState, held: Bool) -> tuple[Float, Bool]:
-    """Return the step (J^T J + lambda diag(J^T J))^-1 (-J^T r) with the held coordinates at rest, and where it exists.
+def _solve(state: DampedState, on_wall: Bool) -> tuple[Float, Bool]:
+    """Return the step (J^T J + lambda diag(J^T J))^-1 (-J^T r) and where it exists; coordinates on a wall rest.
 
     Shapes (R, P, D) and (R, P); where there is no step it is 0.
     """
     scale = np.einsum("rpdd->rpd", state.normal)
     # A floor keeps a coordinate without influence (a pose set that says nothing of it) from dividing by zero.
     scale = np.maximum(scale, 1e-12 * scale.max(axis=2, keepdims=True))
-    free: Bool = np.logical_not(held)
+    free: Bool = np.logical_not(on_wall)
     pairs: Bool = free[..., :, None] & free[..., None, :]
     matrix = state.normal * pairs
-    diagonal = np.where(held, 1.0, np.einsum("rpdd->rpd", matrix) + state.damping[..., None] * scale)
+    diagonal = np.where(on_wall, 1.0, np.einsum("rpdd->rpd", matrix) + state.damping[..., None] * scale)
     index = np.arange(matrix.shape[-1])
     matrix[..., index, index] = diagonal
     usable: Bool = np.logical_and(
         np.isfinite(matrix).all(axis=(2, 3)), np.isfinite(state.gradient).all(axis=2)
     )
     matrix = np.where(usable[..., None, None], matrix, np.eye(len(index)))
-    right = np.where(held | ~usable[..., None], 0.0, -state.gradient)
+    right = np.where(on_wall | ~usable[..., None], 0.0, -state.gradient)
     step = _solutions(matrix, right)
     usable &= np.isfinite(step).all(axis=2)
     return np.where(usable[..., None], step, 0.0), usable
@@ -135,11 +144,11 @@ def _solutions(matrix: Float, right: Float) -> Float:
     """Return the solutions of systems of shape (R, P, D, D), shape (R, P, D); NaN for a singular one."""
     with suppress(np.linalg.LinAlgError):
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0])
-    found = np.full_like(right, np.nan)
+    solutions = np.full_like(right, np.nan)
     for place in np.ndindex(right.shape[:2]):  # numpy does not say which of them it was
         with suppress(np.linalg.LinAlgError):
-            found[place] = np.linalg.solve(matrix[place], right[place])
-    return found
+            solutions[place] = np.linalg.solve(matrix[place], right[place])
+    return solutions
 
 
 def _status(fx: Float) -> np.ndarray[tuple[int], np.dtype[np.int8]]:

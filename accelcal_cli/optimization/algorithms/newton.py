@@ -51,14 +51,11 @@ class Newton(Optimizer[State]):
         x = np.clip(state.x - step, problem.lower, problem.upper)
         fx = problem.cost(x)
         small = np.abs(step).max(axis=2) <= self.step_tolerance * (problem.upper - problem.lower).max()
-        lost = ~usable | ~np.isfinite(fx)
+        failed = ~usable | ~np.isfinite(fx)
         status = np.where(
             (small & usable).any(axis=1),
             Status.CONVERGED,
-            np.where(lost.all(axis=1), Status.FAILED, Status.RUNNING),
+            np.where(failed.all(axis=1), Status.FAILED, Status.RUNNING),
         )
-        return State(_kept(x, state.x, lost), fx, status=status.astype(np.int8))
-
-
-def _kept(x: Float, old: Float, lost: Bool) -> Float:
-    return np.where(lost[..., None], old, x)
+        x = np.where(failed[..., None], state.x, x)
+        return State(x, fx, status=status.astype(np.int8))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.optimization.operators import best_of, better_of, press
+from accelcal_cli.optimization.operators import best_of, better_of, clip
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
@@ -51,9 +51,9 @@ def velocity(
     to_memory *= r2
     to_memory *= cognitive
     to_leader += to_memory
-    moved = v * inertia
-    moved += to_leader
-    return moved
+    new = v * inertia
+    new += to_leader
+    return new
 
 
 @OPTIMIZERS.register("pso")
@@ -83,9 +83,9 @@ class ParticleSwarm(Optimizer[SwarmState]):
         v = velocity(x, state.velocity, state.memory, state.leader, r1, r2, *pulls)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
-        press(v, -limit, limit)
+        clip(v, -limit, limit)
         x = x + v  # [dpso2014] eq. 2
-        press(x, low, high)
+        clip(x, low, high)
         fx = problem.cost(x)
         memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)
         return SwarmState(x, fx, v, memory, memory_cost, best_of(memory, memory_cost))

@@ -168,15 +168,15 @@ class ShadeCma(Optimizer[ShadeState | CmaState]):
         M_CR becomes TERMINAL when every successful CR is 0, and stays so.
         """
         total = gain.sum(axis=1)
-        learned = (total > 0) & np.isfinite(total)
-        w = gain / np.where(learned, total, 1.0)[:, None]
-        rows = np.flatnonzero(learned)
+        useful = (total > 0) & np.isfinite(total)
+        w = gain / np.where(useful, total, 1.0)[:, None]
+        rows = np.flatnonzero(useful)
         weights, rates = state.weights.copy(), state.rates.copy()
         entry = state.position[rows]
         weights[rows, entry] = _lehmer(w[rows], F[rows])
         ended = np.isnan(rates[rows, entry]) | ~(CR[rows] * (gain[rows] > 0)).any(axis=1)
         rates[rows, entry] = np.where(ended, TERMINAL, _lehmer(w[rows], CR[rows]))
-        position = np.where(learned, (state.position + 1) % self.memory, state.position)
+        position = np.where(useful, (state.position + 1) % self.memory, state.position)
         return replace(state, weights=weights, rates=rates, position=position)
 
     def _archive(self, state: ShadeState, better: Bool, u: Float) -> ShadeState:
@@ -185,11 +185,11 @@ class ShadeCma(Optimizer[ShadeState | CmaState]):
         if not capacity:
             return state
         archive, limit = state.archive.copy(order="K"), int(self.archive * state.x.shape[1])
-        run, lost = np.nonzero(better)
+        run, loser = np.nonzero(better)
         count = np.cumsum(better, axis=1)
-        slot = state.archived[run] + count[run, lost] - 1
-        slot = np.where(slot < limit, slot, (u[run, lost] * limit).astype(np.intp))
-        archive[run, slot] = state.x[run, lost]
+        slot = state.archived[run] + count[run, loser] - 1
+        slot = np.where(slot < limit, slot, (u[run, loser] * limit).astype(np.intp))
+        archive[run, slot] = state.x[run, loser]
         return replace(state, archive=archive, archived=np.minimum(limit, state.archived + count[:, -1]))
 
     def _reduce(self, state: ShadeState) -> ShadeState:
@@ -286,17 +286,17 @@ def _cma_step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> C
     x, y = _sample(problem, state, rng)
     fx = problem.cost(x)
     rows, order = np.arange(len(fx))[:, None], np.argsort(fx, axis=1, kind="stable")
-    ranked, chosen = fx[rows, order], y[rows, order[:, : len(k.weights)]]
-    moved = np.add.reduce(k.weights[:, None] * chosen, axis=1)  # eq. 41
-    mean = state.mean + state.sigma[:, None] * moved  # eq. 42
-    kept, push = 1 - k.c_sigma, math.sqrt(k.c_sigma * (2 - k.c_sigma) * k.mu_eff)
-    path_sigma = kept * state.path_sigma + push * _whiten(state, moved)  # eq. 43
+    ranked, steps = fx[rows, order], y[rows, order[:, : len(k.weights)]]
+    step = np.add.reduce(k.weights[:, None] * steps, axis=1)  # eq. 41
+    mean = state.mean + state.sigma[:, None] * step  # eq. 42
+    decay, push = 1 - k.c_sigma, math.sqrt(k.c_sigma * (2 - k.c_sigma) * k.mu_eff)
+    path_sigma = decay * state.path_sigma + push * _whiten(state, step)  # eq. 43
     length = np.sqrt(np.add.reduce(path_sigma**2, axis=1))
     sigma = _step_size(problem, state.sigma, length, ranked, k)
-    bound = (1.4 + 2 / (D + 1)) * k.chi * math.sqrt(1 - kept ** (2 * (state.generation + 1)))
+    bound = (1.4 + 2 / (D + 1)) * k.chi * math.sqrt(1 - decay ** (2 * (state.generation + 1)))
     short = (length < bound)[:, None]  # h_sigma
-    path_c = (1 - k.c_c) * state.path_c + short * math.sqrt(k.c_c * (2 - k.c_c) * k.mu_eff) * moved  # eq. 45
-    C = _adapt(state.C, path_c, chosen, short, k)
+    path_c = (1 - k.c_c) * state.path_c + short * math.sqrt(k.c_c * (2 - k.c_c) * k.mu_eff) * step  # eq. 45
+    C = _adapt(state.C, path_c, steps, short, k)
     values, axes = np.linalg.eigh(C)
     lengths = np.sqrt(np.maximum(values, 0.0))
     used = state.used + samples
@@ -308,17 +308,17 @@ def _cma_step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> C
 
 
 def _sample(problem: Problem, state: CmaState, rng: Streams) -> tuple[Float, Float]:
-    """Return new points, pressed into the box, and their steps from the mean over sigma, shapes (R, P, D)."""
+    """Return new points, clipped to the box, and their steps from the mean over sigma, shapes (R, P, D)."""
     z = rng.normal(*state.x.shape[1:])
     y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
     mean, sigma = state.mean[:, None], state.sigma[:, None, None]
     sample = mean + sigma * y  # eq. 40
     x = np.clip(sample, *problem.limits)
-    pressed = x != sample
-    if pressed.any():
+    clipped = x != sample
+    if clipped.any():
         # The other steps stay as drawn, not as rounded: rounded to the spacing of doubles around the mean they shrink
         # to nothing, and sigma with them, one step of that spacing before the minimum.
-        y = np.where(pressed, (x - mean) / sigma, y)
+        y = np.where(clipped, (x - mean) / sigma, y)
     return x, y
 
 
@@ -339,12 +339,12 @@ def _whiten(state: CmaState, y: Float) -> Float:
     return white
 
 
-def _adapt(C: Float, path: Float, chosen: Float, short: Float, k: _Constants) -> Float:
+def _adapt(C: Float, path: Float, steps: Float, short: Float, k: _Constants) -> Float:
     """Return the new covariance, eq. 47: rank-one update by the path, rank-mu update by the best samples."""
-    lost = (1 - short) * k.c_c * (2 - k.c_c)
-    kept = 1 - k.c_1 - k.c_mu + k.c_1 * lost[..., None]
+    loss = (1 - short) * k.c_c * (2 - k.c_c)
+    decay = 1 - k.c_1 - k.c_mu + k.c_1 * loss[..., None]
     rank_one = path[:, :, None] * path[:, None, :]
-    rank_mu = (chosen * k.weights[:, None]).swapaxes(1, 2) @ chosen
-    C = kept * C + k.c_1 * rank_one + k.c_mu * rank_mu
+    rank_mu = (steps * k.weights[:, None]).swapaxes(1, 2) @ steps
+    C = decay * C + k.c_1 * rank_one + k.c_mu * rank_mu
     symmetric: Float = 0.5 * (C + C.swapaxes(1, 2))
     return symmetric

@@ -1,1 +1,1 @@
-"""The grey wolf optimizer for accelcal."""
+"""The grey wolf optimizer and a text format for accelcal."""

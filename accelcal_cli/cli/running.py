@@ -1,0 +1,153 @@
+"""Running a study: the options that every command with a study has, and the running itself.
+
+The progress bar, the journal of finished runs beside the raw file, and the message when it ends early.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from accelcal_cli.cli import options, process
+from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
+
+if TYPE_CHECKING:
+    from accelcal_cli.studies.engine import Executors, Journal, Progress
+    from accelcal_cli.studies.study import Record, Study
+
+MOST_JOBS = 1024
+RAW_SUFFIXES = (".csv", ".parquet")
+PLOT_SUFFIXES = (".png", ".svg")
+
+in_runs = options.panel("Runs")
+
+Seed = Annotated[int, in_runs("--seed", help="Seed of all random numbers.", min=0)]
+Plot = Annotated[
+    str | None,
+    options.in_output("--plot", help="Draw convergence to a .png or .svg file.", metavar="FILE"),
+]
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Where the runs of a study are made, and where they are kept."""
+
+    jobs: Annotated[
+        int, in_runs("--jobs", "-j", help="Processes on this machine.", min=1, max=MOST_JOBS, metavar="N")
+    ] = 1
+    cluster: Annotated[
+        str | None, in_runs("--cluster", help="Run on a Dask cluster: tcp://host:8786.", metavar="ADDRESS")
+    ] = None
+    raw: Annotated[
+        str | None,
+        in_runs("--raw", help="File for the result of every run: .csv or .parquet.", metavar="FILE"),
+    ] = None
+    resume: Annotated[
+        bool,
+        in_runs("--resume", help="Go on with an interrupted study; its runs are in FILE.journal."),
+    ] = False
+    quiet: options.Quiet = False
+
+    def run(self, study: Study) -> list[Record]:
+        """Run a study, write the raw file, and return all records by cell and run.
+
+        With a raw file the finished runs are kept in a journal beside it until it is written.
+
+        Raises:
+            UsageError: options that do not go together, or a raw file with another suffix.
+            AccelcalError: what the study, the journal or the cluster could not do.
+        """
+        self._check()
+        from accelcal_cli.output.machine import write_table
+        from accelcal_cli.studies.engine import Journal, run_study
+        from accelcal_cli.views.studies import raw_table
+
+        journal = Journal.open(Path(f"{self.raw}.journal") if self.raw else None, study, self.resume)
+        try:
+            with _progress(self.quiet) as progress:
+                records = run_study(study, journal, self._executors(study), progress)
+            if self.raw is not None:
+                write_table(raw_table(study, records), self.raw)
+        except KeyboardInterrupt as stop:
+            ending = process.interrupted(stop)
+            raise Interrupted(f"{ending}{_kept(journal)}", ending.code) from None
+        except AccelcalError as error:
+            raise type(error)(f"{error}{_kept(journal)}") from None
+        journal.remove()
+        return records
+
+    def _check(self) -> None:
+        if self.raw is not None:
+            _check_target("--raw", self.raw, RAW_SUFFIXES)
+        elif self.resume:
+            raise UsageError("--resume needs the --raw FILE of the interrupted study")
+        if self.cluster is not None and self.jobs != 1:
+            raise UsageError("--jobs and --cluster: expected one of them, not both")
+
+    def _executors(self, study: Study) -> Executors | None:
+        from accelcal_cli.studies import pools
+
+        if self.cluster is not None:
+            return partial(pools.cluster, self.cluster)
+        useful = min(self.jobs, len(study.tasks()))
+        return partial(pools.local_pool, useful) if useful > 1 else None
+
+
+def check_plot(plot: str | None) -> None:
+    """Refuse a plot that could not be written, before any run is made for it.
+
+    Raises:
+        UsageError: another suffix, or matplotlib is missing.
+        OutputError: the file cannot be written.
+    """
+    if plot is None:
+        return
+    from importlib.util import find_spec
+
+    _check_target("--plot", plot, PLOT_SUFFIXES)
+    if find_spec("matplotlib") is None:
+        raise UsageError("--plot needs matplotlib: pip install 'accelcal[plot]'")
+
+
+def _check_target(option: str, path: str, suffixes: tuple[str, ...]) -> None:
+    from accelcal_cli.output.files import check_target
+
+    options.check_suffix(option, path, suffixes)
+    check_target(path)
+
+
+def _kept(journal: Journal) -> str:
+    """Return what to say of finished runs after a failure; a journal without any is removed."""
+    if not journal.done:
+        journal.remove()
+    if journal.path is None or not journal.done:
+        return ""
+    runs = sum(map(len, journal.done.values()))
+    return f"; {runs:,} finished runs are kept in {journal.path}, --resume goes on with them"
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Progress | None]:
+    """Open a bar with the time left on standard error, when somebody looks at it."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("runs", total=None)
+
+        def update(done: int, total: int) -> None:
+            if bar.tasks[0].total is None:
+                bar.reset(task, total=total, completed=done)
+            bar.update(task, completed=done)
+
+        yield update

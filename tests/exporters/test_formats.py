@@ -1,0 +1,254 @@
+"""Every format, applied as its target would, gives the specific force of the result."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import yaml
+from simulated import MEMS, readings
+
+from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.errors import ConfigError, UsageError
+from accelcal_cli.exporters.base import EXPORTERS
+from accelcal_cli.io.readings import read_readings
+from accelcal_cli.sensor import poses
+from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
+
+G = 9.8
+COUNTS = ErrorModel(415.0 * MEMS.K, 415.0 * MEMS.D + 120.0)
+READING = np.array([[0.3, -4.0, 8.9], [1.0, 9.7, -0.2], [-5.0, 5.0, -6.0]])
+
+
+def result(model=MEMS, g=G, gauge="lower"):
+    settings = Settings(optimizer="levenberg-marquardt", g=g, gauge=gauge)
+    return calibrate(readings(poses.turns(), model=model, g=g, sigma=1e-4 * g), settings)
+
+
+@pytest.fixture(scope="module")
+def metres():
+    return result()
+
+
+@pytest.fixture(scope="module")
+def in_g():
+    return result(ErrorModel(MEMS.K, MEMS.D / G), 1.0)
+
+
+@pytest.fixture(scope="module")
+def counts():
+    return result(COUNTS)
+
+
+def export(found, name, **options):
+    return EXPORTERS.build(name, options, name).export(found)
+
+
+def text(made):
+    return made.content.decode()
+
+
+def diagonal(K, D, reading):
+    return (reading - D) / np.diagonal(K)
+
+
+def parameters(made, separator):
+    rows = [line.split(separator) for line in text(made).splitlines() if not line.startswith("#")]
+    return {
+        row[-3] if separator == "\t" else row[0]: float(row[-2] if separator == "\t" else row[1])
+        for row in rows
+    }
+
+
+def autopilot(values, offset, scale, reading):
+    """(reading - offset) * scale, axis by axis: PX4's Accelerometer::Correct and ArduPilot's backend."""
+    off = np.array([values[offset.format(axis)] for axis in "XYZ"])
+    return (reading - off) * np.array([values[scale.format(axis)] for axis in "XYZ"])
+
+
+AUTOPILOTS = {
+    "px4": ("\t", "CAL_ACC0_{}OFF", "CAL_ACC0_{}SCALE"),
+    "ardupilot": (",", "INS_ACCOFFS_{}", "INS_ACCSCAL_{}"),
+}
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+def test_an_autopilot_gets_the_diagonal_model(metres, name):
+    separator, offset, scale = AUTOPILOTS[name]
+    made = export(metres, name)
+    force = autopilot(parameters(made, separator), offset, scale, READING)
+    np.testing.assert_allclose(force, diagonal(metres.K_a, metres.D_a, READING), rtol=1e-7, atol=1e-7)
+    exact = metres.model.specific_force(READING)
+    told = float(made.warnings[0].split("error of up to ")[1].split()[0])
+    lengths = np.linalg.norm(exact, axis=1)
+    assert (np.linalg.norm(force - exact, axis=1) <= 1.05 * told * lengths / G + 1e-6).all()
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+def test_readings_in_g_are_metres_to_an_autopilot(in_g, name):
+    separator, offset, scale = AUTOPILOTS[name]
+    values = parameters(export(in_g, name), separator)
+    force = autopilot(values, offset, scale, READING * STANDARD_GRAVITY)
+    np.testing.assert_allclose(
+        force, STANDARD_GRAVITY * diagonal(in_g.K_a, in_g.D_a, READING), rtol=1e-7, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+def test_counts_need_the_scale_of_the_driver(counts, name):
+    separator, offset, scale = AUTOPILOTS[name]
+    with pytest.raises(UsageError, match="--driver-scale"):
+        export(counts, name)
+    values = parameters(export(counts, name, driver_scale=417.7), separator)
+    raw = READING * 415.0
+    force = autopilot(values, offset, scale, raw / 417.7)
+    np.testing.assert_allclose(force, diagonal(counts.K_a, counts.D_a, raw), rtol=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+@pytest.mark.parametrize("driver_scale", [1.0, 9.81, 4150.0])
+def test_a_driver_scale_of_other_readings_is_refused(counts, name, driver_scale):
+    with pytest.raises(UsageError, match=f"--driver-scale {driver_scale:g}: the calibrated readings are 41"):
+        export(counts, name, driver_scale=driver_scale)
+
+
+def test_cautions_stand_in_the_comments(metres):
+    doubtful = dataclasses.replace(metres, cautions=("The sensor moved.",))
+    for name in ("px4", "ardupilot", "kalibr", "ros", "c-header"):
+        assert "caution: The sensor moved." in text(export(doubtful, name))
+
+
+def test_the_symmetric_gauge_halves_what_an_autopilot_drops(metres):
+    def angle(which):
+        return float(export(which, "px4").warnings[0].split("up to ")[1].split()[0])
+
+    assert angle(result(gauge="symmetric")) < 0.7 * angle(metres)
+
+
+def test_instances_have_their_names(metres):
+    assert "CAL_ACC2_XOFF" in text(export(metres, "px4", instance=2))
+    assert "INS_ACC2OFFS_X" in text(export(metres, "ardupilot", instance=1))
+    assert text(export(metres, "kalibr", instance=1)).count("imu1:") == 1
+    for name, instance in (("px4", 4), ("ardupilot", 3)):
+        with pytest.raises(
+            ConfigError, match=f"instance: {instance} is too large; expected at most {instance - 1}"
+        ):
+            export(metres, name, instance=instance)
+
+
+def test_parameters_that_an_autopilot_would_refuse_are_told():
+    odd = result(ErrorModel(MEMS.K, MEMS.D + 5.0))
+    assert any("3.5 m/s^2" in warning for warning in export(odd, "ardupilot").warnings)
+
+
+@pytest.mark.parametrize("which", ["metres", "in_g", "counts"])
+def test_kalibr_has_the_whole_model_in_gauge_lower(which, request):
+    found = request.getfixturevalue(which)
+    imu = yaml.safe_load(text(export(found, "kalibr")))["imu0"]
+    M, b = np.array(imu["accelerometers"]["M"]), np.array(imu["accelerometers"]["b"])
+    assert (np.triu(M, 1) == 0).all()
+    assert imu["model"] == "scale-misalignment"
+    raw, factor = (
+        (READING * 415, 1.0) if which == "counts" else (READING, STANDARD_GRAVITY if which == "in_g" else 1.0)
+    )
+    force = np.linalg.solve(M, (raw * factor - b).T).T
+    np.testing.assert_allclose(force, factor * found.model.in_gauge("lower").specific_force(raw), rtol=1e-12)
+    assert [key for key, value in imu.items() if value is None] == [
+        "accelerometer_noise_density", "accelerometer_random_walk", "gyroscope_noise_density", "gyroscope_random_walk",
+        "update_rate", "rostopic",
+    ]  # fmt: skip
+    assert "PLACEHOLDERS" in text(export(found, "kalibr"))
+
+
+@pytest.mark.parametrize(("which", "unit"), [("metres", "m/s^2"), ("in_g", "g"), ("counts", "a.u.")])
+def test_imucal_corrects_with_two_matrices(which, unit, request):
+    found = request.getfixturevalue(which)
+    record = json.loads(text(export(found, "imucal")))
+    K, R, b = (np.array(record[key]) for key in ("K_a", "R_a", "b_a"))
+    raw = READING * (415 if which == "counts" else 1)
+    force = (np.linalg.inv(R) @ np.linalg.inv(K) @ (raw - b).T).T
+    np.testing.assert_allclose(force, found.model.specific_force(raw), rtol=1e-12, atol=1e-12)
+    assert (record["cal_type"], record["_format_version"]) == ("Ferraris", "2.0.0")
+    assert (record["acc_unit"], record["from_acc_unit"]) == (found.unit, unit)
+    np.testing.assert_array_equal(record["K_g"], np.eye(3))
+
+
+@pytest.mark.parametrize("which", ["metres", "in_g", "counts"])
+def test_ros_subtracts_the_bias_after_the_matrix(which, request):
+    found = request.getfixturevalue(which)
+    file = yaml.safe_load(text(export(found, "ros")))
+    raw = READING * (415 if which == "counts" else 1)
+    force = raw @ np.reshape(file["SM"], (3, 3)).T - file["bias"]
+    metres_per_unit = STANDARD_GRAVITY if which == "in_g" else 1.0
+    np.testing.assert_allclose(
+        force, metres_per_unit * found.model.specific_force(raw), rtol=1e-12, atol=1e-12
+    )
+
+
+PROGRAM = """
+#include <stdio.h>
+#include "calibration.h"
+int main(void) {{
+    const double readings[3][3] = {{{rows}}};
+    double force[3];
+    for (int j = 0; j < 3; j++) {{
+        accelcal_apply(readings[j], force);
+        printf("%.17g %.17g %.17g\\n", force[0], force[1], force[2]);
+    }}
+    return 0;
+}}
+"""
+
+
+@pytest.mark.parametrize("language", ["c", "c++"])
+def test_the_c_header_compiles_and_applies(metres, tmp_path, language):
+    compiler = shutil.which("cc") if language == "c" else shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no compiler")
+    (tmp_path / "calibration.h").write_bytes(export(metres, "c-header").content)
+    rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in READING.tolist())
+    source = tmp_path / f"main.{'c' if language == 'c' else 'cc'}"
+    source.write_text(PROGRAM.format(rows=rows))
+    flags = ["-Wall", "-Wextra", "-Werror", "-pedantic", *(["-std=c99"] if language == "c" else [])]
+    subprocess.run([compiler, *flags, str(source), "-o", str(tmp_path / "main")], check=True)
+    printed = subprocess.run([tmp_path / "main"], check=True, capture_output=True, text=True).stdout
+    force = np.array([[float(v) for v in line.split()] for line in printed.splitlines()])
+    np.testing.assert_allclose(force, metres.model.specific_force(READING), rtol=1e-12, atol=1e-12)
+    assert '#define ACCELCAL_UNIT "m/s^2"' in text(export(metres, "c-header"))
+
+
+def test_numpy_arrays(metres):
+    with np.load(io.BytesIO(export(metres, "numpy").content)) as file:
+        np.testing.assert_allclose(
+            READING @ file["K_A"].T - file["f_0"],
+            metres.model.specific_force(READING),
+            rtol=1e-12,
+            atol=1e-12,
+        )
+        np.testing.assert_array_equal(file["K_a"], metres.K_a)
+        np.testing.assert_array_equal(file["D_a"], metres.D_a)
+        assert (float(file["g"]), str(file["unit"])) == (G, "m/s^2")
+        assert metres.data["sha256"] in str(file["origin"])
+
+
+def test_an_unknown_format_is_refused(metres):
+    with pytest.raises(ConfigError, match='unknown export format "px5" \\(did you mean "px4"'):
+        export(metres, "px5")
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+def test_the_misalignment_of_a_real_sensor_is_warned_of(shared_data, name):
+    found = calibrate(
+        read_readings(shared_data / "ctu_innalabs" / "static_24.csv"),
+        Settings(optimizer="levenberg-marquardt", g=1.0),
+    )
+    made = export(found, name)
+    for place in (made.warnings[0], text(made)):
+        assert "53.2 mrad (0.053 rad, axis z towards x)" in place
+        assert "0.54 m/s^2" in place
