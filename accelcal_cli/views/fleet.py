@@ -19,6 +19,9 @@ SHOWN = 10
 WORST = 5
 """Sensors with the largest rms that the summary names."""
 
+ADVICE = " Add these poses:"
+"""Where the advice behind a reason begins, for which the summary has no room."""
+
 CLAUSE = re.compile(r"[:.] ")
 """Where the first clause of a caution ends."""
 
@@ -200,6 +203,6 @@ def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table
 def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
     """Return the sensors whose verdict is not good, the worst verdict first."""
     order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
-    rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r]) for r in order[:SHOWN])
+    rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r].partition(ADVICE)[0]) for r in order[:SHOWN])
     notes = (f"And {len(bad) - SHOWN:,} more.",) if len(bad) > SHOWN else ()
     return Table("Not good", (Column("sensor"), Column("verdict"), Column("why")), rows, notes)
