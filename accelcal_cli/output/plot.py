@@ -81,10 +81,8 @@ def _panel(
             color="0.4",
             va="bottom",
         )
-    axes.set_yscale("log")
     axes.set_title(name, fontsize=10)
-    axes.set_xlabel("evaluations")
-    axes.set_ylabel("median best cost")
+    axes.set(yscale="log", xlabel="evaluations", ylabel="median best cost")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.ticklabel_format(axis="x", style="plain")
     axes.locator_params(axis="x", integer=True)
@@ -149,8 +147,7 @@ def plot_log(detection: Detection, path: str) -> None:
             fontsize=11,
             pad=14,
         )
-        axes.set_xlabel("row" if detection.intervals.time is None else "time")
-        axes.set_ylabel("output, sensor units")
+        axes.set(xlabel="row" if detection.intervals.time is None else "time", ylabel="output, sensor units")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 

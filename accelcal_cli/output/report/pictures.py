@@ -38,12 +38,10 @@ def residuals(result: Calibration) -> str:
             axes.plot(x[~named], y[~named], "o", color=colour, markersize=3.2)
             axes.plot(x[named], y[named], "X", color=BAD, markersize=7)
             axes.axhline(0.0, color=INK, linewidth=0.8)
-            axes.set_title(title)
-            axes.set_ylabel(f"|f| - g [{result.unit}]")
+            axes.set(title=title, ylabel=f"|f| - g [{result.unit}]")
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.set_xlim(x.min() - 0.7, x.max() + 0.7)
+        axes.set(xlim=(x.min() - 0.7, x.max() + 0.7), xlabel="pose")
         _whole_numbers(axes)
-        axes.set_xlabel("pose")
     largest = [np.abs(y).max(initial=0.0) for *_, y in panels]
     outliers = f"; outliers (with a cross): {named.sum()}" if named.any() else ""
     return inline(
@@ -65,9 +63,7 @@ def convergence(result: Calibration) -> str:
         if result.cost > 0 and result.settings.get("polish", True):
             axes.axhline(result.cost, color=BEFORE, linestyle="--", linewidth=1.0, label="after the polish")
             axes.legend(frameon=False, loc="upper right")
-        axes.set_yscale("log")
-        axes.set_xlabel("evaluations")
-        axes.set_ylabel(f"best cost L [({result.unit})^4]")
+        axes.set(yscale="log", xlabel="evaluations", ylabel=f"best cost L [({result.unit})^4]")
         axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
     first, last = points[0], points[-1]
     return inline(
@@ -111,8 +107,7 @@ def dilution(result: Calibration) -> str:
 
 
 def _log_bars(axes: Axes, start: float, end: float) -> None:
-    axes.set_xscale("log")
-    axes.set_xlim(start, end)
+    axes.set(xscale="log", xlim=(start, end))
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -166,9 +161,7 @@ def _hemisphere(axes: Axes, sign: float) -> None:
         axes.plot([0, x], [0, y], color=FAINT, linewidth=0.6)
         axes.text(1.14 * x, 1.14 * y, name, ha="center", va="center")
     axes.set_title("+z up" if sign > 0 else "-z up", loc="center", pad=10)
-    axes.set_xlim(-1.25, 1.25)
-    axes.set_ylim(-1.25, 1.25)
-    axes.set_aspect("equal")
+    axes.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25), aspect="equal")
     axes.set_axis_off()
 
 
