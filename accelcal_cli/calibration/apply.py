@@ -16,7 +16,7 @@ from typing import IO
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.fit import gauge_chain
+from accelcal_cli.calibration.observability import gauge_chain
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.columns import Columns, choose

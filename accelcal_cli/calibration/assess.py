@@ -14,24 +14,11 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.distributions import chi_square_chance
 from accelcal_cli.calibration.fit import Fit
-from accelcal_cli.calibration.observability import (
-    ALIGNED,
-    SCALE,
-    UNDETERMINED,
-    WEAK,
-    Observability,
-    Verdict,
-    knowing,
-    next_poses,
-)
+from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Verdict, poses_to_add
 from accelcal_cli.calibration.search import Solution, rounding
-from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
-FEWEST_POSES = 12
-"""Suggested poses bring a poor set to at least this many: nine fit exactly and say nothing of their noise."""
-
-COMFORTABLE, MOST_SUGGESTIONS = 5.0, 8
-"""Suggested poses bring every dilution of precision to this, half of what counts as weak; and how many they are."""
+FEWEST_KNOWN = 6
+"""Poses that a poor set is brought to where the attitudes are known."""
 
 MORE_THAN_NOISE, SURELY = 2.0, 1e-3
 """Residuals this many times their noise, and by chance this rarely, are told of."""
@@ -73,8 +60,6 @@ class Assessment:
         suggestions: poses to add, in words.
         cautions: what speaks against the readings or the search, in sentences, the gravest first.
         outliers: numbers of the poses beyond chance, from 0.
-        dop, information: what the words rest on, shapes (R, p) and (R, 9, 9).
-        sight: K and D, gauge `lower`, that the directions of the poses are seen with, shapes (R, 3, 3) and (R, 3).
     """
 
     fit: Fit
@@ -83,9 +68,6 @@ class Assessment:
     suggestions: list[tuple[str, ...]]
     cautions: list[tuple[str, ...]]
     outliers: list[tuple[int, ...]]
-    dop: Float
-    information: Float
-    sight: tuple[Float, Float]
 
 
 def assess(fit: Fit) -> Assessment:
@@ -97,13 +79,11 @@ def assess(fit: Fit) -> Assessment:
             fit.observability.verdicts, walled, fit.freedom.tolist(), strict=True
         )
     ]
-    views, dop, determined, sight = _first_sight(fit)
     reasons: list[tuple[str, ...]] = [()] * len(verdicts)
     suggestions = list(reasons)
     for at, verdict in enumerate(verdicts):
         if verdict != "good":
-            suggestions[at] = _suggestions(fit, views[at], determined[at], int(fit.sample.poses[at]))
-            reasons[at] = _reasons(fit, views[at], suggestions[at], at)
+            suggestions[at], reasons[at] = _advice(fit, at)
     pose, outlier = fit.residuals.pose, fit.residuals.outlier
     outliers: list[tuple[int, ...]] = [()] * len(verdicts)
     for at in np.flatnonzero(outlier.any(axis=1)).tolist():
@@ -112,7 +92,7 @@ def assess(fit: Fit) -> Assessment:
     left = _to_gain(fit)
     for at in np.flatnonzero(_may_have_cautions(fit, left)).tolist():
         cautions[at] = _cautions(fit, at, float(left[at]), outliers[at])
-    return Assessment(fit, verdicts, reasons, suggestions, cautions, outliers, dop, determined, sight)
+    return Assessment(fit, verdicts, reasons, suggestions, cautions, outliers)
 
 
 def _final_verdict(poses: Verdict, walled: bool, freedom: int) -> Verdict:
@@ -122,55 +102,22 @@ def _final_verdict(poses: Verdict, walled: bool, freedom: int) -> Verdict:
     return "weak" if freedom == 0 and poses == "good" else poses
 
 
-def _first_sight(fit: Fit) -> tuple[Observability, Float, Float, tuple[Float, Float]]:
-    """Return the observability that verdicts are explained with, dop and information of it, and the sensors' K and D.
-
-    Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
-    nearest sphere then sees the attitudes better than the fit does.
-    """
-    own = fit.observability, fit.dop, fit.information, (fit.lower, fit.D)
-    solution = fit.solution
-    if solution is None or "sphere" not in solution.stated.start.sources:
-        return own
-    held = None if fit.settings.misalignment else ALIGNED
-    K, D = solution.cost.parameters(np.zeros_like(solution.x))
-    nine, point = solution.plain.in_lower(K, D)
-    determined = nine.information(point)
-    views = Observability.of(determined, fit.sample.poses, held)
-    sphere = np.array([source == "sphere" for source in solution.stated.start.sources])
-    sphere &= np.array([verdict == "undetermined" for verdict in views.verdicts])
-    mixed = fit.observability.replaced(sphere, views)
-    own_K, own_D = np.where(sphere[:, None, None], K, fit.lower), np.where(sphere[:, None], D, fit.D)
-    kept = np.where(sphere[:, None, None], determined, fit.information)
-    return mixed, mixed.dop, kept, (own_K, own_D)
-
-
-def _suggestions(fit: Fit, view: Observability, determined: Float, poses: int) -> tuple[str, ...]:
-    """Return the poses that would bring a sensor to a good verdict, in words."""
-    if view.verdict == "good" or fit.solution is None:
-        return ()
-    whole = fit.settings.misalignment
-    candidates = fixture_directions() if whole else faces()
-    known = determined if whole else knowing(determined, ALIGNED)
-    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
-    return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
-
-
-def _reasons(fit: Fit, view: Observability, suggestions: Sequence[str], at: int) -> tuple[str, ...]:
-    """Return why the verdict on a sensor is not good, in sentences."""
-    known_attitudes = fit.solution is None
-    whose = "The known attitudes" if known_attitudes else "The poses"
-    lines = list(poorly_determined(view, suggestions, whose))
-    fewest = 6 if known_attitudes else FEWEST_POSES
+def _advice(fit: Fit, at: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the poses that would bring a sensor to a good verdict, in words, and why it is not, in sentences."""
+    known = fit.solution is None
     freedom, poses = int(fit.freedom[at]), int(fit.sample.poses[at])
+    view, fewest = fit.view[at], FEWEST_KNOWN if known else FEWEST_POSES
+    suggestions: tuple[str, ...] = ()
+    if not known and view.verdict != "good":
+        suggestions = poses_to_add(fit.information[at], poses, aligned=not fit.settings.misalignment)
+    lines = list(view.in_words("The known attitudes" if known else "The poses", suggestions))
+    number = {4: "four", 6: "six", 9: "nine"}.get(poses - freedom, str(poses - freedom))
     if freedom < 0:
-        needed = poses - freedom
-        words = {6: "six", 9: "nine"}.get(needed, str(needed))
-        lines.insert(0, f"{poses} poses are fewer than the {words} parameters; take at least {fewest}.")
+        lines.insert(0, f"{poses} poses are fewer than the {number} parameters; take at least {fewest}.")
     if freedom == 0:
-        words = {4: "Four", 6: "Six", 9: "Nine"}.get(poses, str(poses))
+        number = {4: "Four"}.get(poses, number.capitalize())
         lines.append(
-            f"{words} poses leave no degrees of freedom, so no uncertainty can be given. Take at least {fewest}."
+            f"{number} poses leave no degrees of freedom, so no uncertainty can be given. Take at least {fewest}."
         )
     beyond = ", ".join(edge_names(fit.at_wall[at]))
     if beyond and view.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
@@ -178,25 +125,7 @@ def _reasons(fit: Fit, view: Observability, suggestions: Sequence[str], at: int)
             f"The least cost lies outside the search box, beyond {beyond}: "
             "widen the box or state the nominal sensor (--config, keys box and nominal)."
         )
-    return tuple(lines)
-
-
-def poorly_determined(
-    view: Observability, suggestions: Sequence[str], whose: str = "The poses"
-) -> tuple[str, ...]:
-    """Return what is not determined, what is weak, and what to add, in sentences."""
-    lines = []
-    lost = view.above(UNDETERMINED)
-    if lost:
-        lines.append(f"{whose} do not determine: {', '.join(lost)}.")
-    elif view.rank < len(view.names):
-        lines.append(f"{whose} do not determine all nine parameters.")
-    weak = [name for name in view.above(WEAK) if name not in lost]
-    if weak:
-        lines.append(f"Weakly determined: {', '.join(weak)}.")
-    if lines and suggestions:
-        lines.append("Add these poses: " + "; ".join(suggestions) + ".")
-    return tuple(lines)
+    return suggestions, tuple(lines)
 
 
 def edge_names(at_wall: Bool) -> tuple[str, ...]:
@@ -232,7 +161,7 @@ def _may_have_cautions(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_cautions` has something to say of, or might have, shape (R,)."""
     g, s, settings = fit.settings.g, fit.s, fit.settings
     noisy = (s > LARGE * g) | (NOISE_BIAS * (s / g) ** 2 > _scale_sigma(fit))
-    noisy |= s**2 >= MORE_THAN_NOISE**2 * fit.expected
+    noisy |= fit.noise_ratio >= MORE_THAN_NOISE
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
     found: Bool = noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always
@@ -254,7 +183,7 @@ def _cautions(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         return (*lines, *_turned_round(fit.K[at]))
     return (
         *lines,
-        *more_than_noise(*fit.noise_ratio(at)),
+        *more_than_noise(float(fit.noise_ratio[at]), float(fit.noise_p[at])),
         *_noise_bias(s, settings.g, float(_scale_sigma(fit)[at])),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),
@@ -308,9 +237,9 @@ def not_fitting(outliers: Sequence[str], freedom: int, *, robust: bool = False) 
     return (f"{subject} not fit the other poses (p < 0.01). {again}.{doubt}",)
 
 
-def more_than_noise(ratio: float | None, chance: float | None) -> tuple[str, ...]:
+def more_than_noise(ratio: float, chance: float) -> tuple[str, ...]:
     """Return a caution of residuals of so many times the noise that the scatter predicts, and its p-value."""
-    if ratio is None or chance is None or ratio < MORE_THAN_NOISE or chance > SURELY:
+    if not (ratio >= MORE_THAN_NOISE and chance <= SURELY):
         return ()
     return (
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "

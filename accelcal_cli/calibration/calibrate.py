@@ -82,13 +82,16 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
     if settings.attitudes == "known":
         from accelcal_cli.calibration.known_attitudes import fit_known
 
-        return assess(fit_known(sample, settings))
-    solution = reweight(search(state(sample, settings), closed=closed))
-    if sample.temperature is not None and settings.temperature:
-        from accelcal_cli.calibration.temperature import with_slopes
+        result = fit_known(sample, settings)
+    else:
+        stated = state(sample, settings)
+        solution = reweight(search(stated, closed=closed))
+        if sample.temperature is not None and settings.temperature:
+            from accelcal_cli.calibration.temperature import with_slopes
 
-        solution = with_slopes(solution)
-    return assess(fit(solution))
+            solution = with_slopes(solution)
+        result = fit(solution)
+    return assess(result)
 
 
 def faults(sample: Sample, settings: Settings) -> list[str]:
@@ -106,11 +109,11 @@ def faults(sample: Sample, settings: Settings) -> list[str]:
 
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
-    fit, dop = assessment.fit, assessment.dop[at]
+    fit = assessment.fit
     settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
     K = fit.K[at]
     K_A = np.linalg.inv(K)
-    ratio, chance = fit.noise_ratio(at)
+    ratio, chance = (None if np.isnan(v) else float(v) for v in (fit.noise_ratio[at], fit.noise_p[at]))
     solution = fit.solution
     return Calibration(
         K_a=K,
@@ -119,7 +122,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         f_0=K_A @ fit.D[at],
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
-        dop=Dop.of(dop),
+        dop=Dop.of(fit.dop[at]),
         verdict=assessment.verdicts[at],
         reasons=assessment.reasons[at],
         suggestions=assessment.suggestions[at],
@@ -134,7 +137,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         noise_ratio=ratio,
         noise_chance=chance,
         covariance=fit.covariance[at],
-        information=assessment.information[at],
+        information=fit.information[at],
         nominal_scale=np.array(fit.nominal[at]),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=int(fit.sample.poses[at]),
@@ -156,7 +159,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:
     fit, readings = assessment.fit, assessment.fit.sample.readings(at)
-    residuals, (K, D) = fit.residuals, assessment.sight
+    residuals, (K, D) = fit.residuals, fit.sight
     real = residuals.real[at]
     output = ErrorModel(fit.lower[at], fit.D[at]).output(residuals.force[at, real])
     force = ErrorModel(K[at], D[at]).specific_force(output)

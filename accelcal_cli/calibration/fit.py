@@ -14,22 +14,14 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
 from accelcal_cli.calibration.observability import (
     ALIGNED,
-    BIAS,
     ROWS_COLUMNS,
     Observability,
     Verdict,
     design,
+    propagate,
 )
-from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import (
-    NO_NOISE,
-    SLOPES,
-    Search,
-    Solution,
-    loss_slope,
-    loss_weight,
-    modulus_errors,
-)
+from accelcal_cli.calibration.sample import Sample, loss_slope, loss_weight
+from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.sensor.model import Gauge, to_gauge
 
@@ -96,7 +88,9 @@ class Fit:
         sigma_K, sigma_D: one-sigma of K and D, NaN where there is none.
         value: L, shape (R,), (m/s^2)^4.
         observability: what the poses say of the parameters, which the verdict rests on.
-        dop: dilution of precision of the nine parameters, shape (R, 9); information: J^T J of them, shape (R, 9, 9).
+        view: the observability that a verdict is explained with; see `_first_sight`.
+        dop: dilution of precision of the nine parameters, shape (R, 9); information: J^T J of them, shape (R, 9, 9);
+            sight: K and D, gauge `lower`, that directions are seen with, shapes (R, 3, 3) and (R, 3); all of the view.
         freedom: degrees of freedom, shape (R,).
         s: standard deviation of one pose's modulus (with known attitudes of one axis), m/s^2, NaN without freedom,
             shape (R,).
@@ -105,7 +99,8 @@ class Fit:
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
         residuals: pose by pose.
-        expected: variance of one pose that the scatter within the poses explains, (m/s^2)^2, shape (R,), or NaN.
+        noise_ratio, noise_p: s over the noise that the scatter within the poses predicts, and the p-value of so large a
+            ratio, shape (R,), NaN where nothing tells.
         solution: what was fitted; None with known attitudes.
         notes: of the solution, in sentences.
     """
@@ -121,8 +116,10 @@ class Fit:
     sigma_D: Float  # noqa: N815
     value: Float
     observability: Observability
+    view: Observability
     dop: Float
     information: Float
+    sight: tuple[Float, Float]
     freedom: Int
     s: Float
     covariance: Float
@@ -132,39 +129,29 @@ class Fit:
     before: list[str]
     nominal: Float
     residuals: PoseResiduals
-    expected: Float
+    noise_ratio: Float
+    noise_p: Float
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
-
-    def noise_ratio(self, at: int) -> tuple[float | None, float | None]:
-        """Return s of a sensor over the noise that its scatter predicts, and the p-value of so large a ratio."""
-        s, expected, freedom = float(self.s[at]), float(self.expected[at]), int(self.freedom[at])
-        if freedom < 1 or not s > 0 or not expected > 0:
-            return None, None
-        ratio = s / float(np.sqrt(expected))
-        return ratio, float(chi_square_chance(np.array([freedom * ratio**2]), np.array([freedom]))[0])
 
 
 def fit(solution: Solution) -> Fit:
     """Fit a solution: one pass over the readings, everything for all sensors at once."""
     settings, sample = solution.stated.settings, solution.sample
-    g = settings.g
+    g, held = settings.g, None if settings.misalignment else ALIGNED
     K, D = solution.cost.parameters(solution.x)
-    nine, point = solution.plain.in_lower(K, D)
-    lower, own_D = nine.parameters(point)
-    information = nine.information(point)
-    if solution.slopes is not None:
-        information = information - solution.slopes.loss
-    held = None if settings.misalignment else ALIGNED
+    lower, own_D, information = _determined(solution, K, D)
     observability = Observability.of(information, sample.poses, held)
     freedom = sample.poses - min(9, solution.cost.unknowns) - SLOPES * (solution.slopes is not None)
     reading = _pass(solution, lower, own_D)
     residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
     variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
+    ratio, p = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
     at_wall = _at_wall(solution.x)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
     shown = to_gauge(K, settings.gauge)
     sigma_K, sigma_D = propagate(shown, lower, covariance, settings.gauge, g)
+    view, information, sight = _first_sight(solution, observability, information, (lower, D))
     return Fit(
         sample=sample,
         settings=settings,
@@ -177,8 +164,10 @@ def fit(solution: Solution) -> Fit:
         sigma_D=sigma_D,
         value=solution.value,
         observability=observability,
-        dop=observability.dop,
+        view=view,
+        dop=view.dop,
         information=information,
+        sight=sight,
         freedom=freedom,
         s=np.sqrt(variance),
         covariance=covariance,
@@ -188,10 +177,50 @@ def fit(solution: Solution) -> Fit:
         before=reading.words,
         nominal=reading.nominal,
         residuals=residuals,
-        expected=reading.sums[2] / sample.poses,
+        noise_ratio=ratio,
+        noise_p=p,
         solution=solution,
         notes=solution.notes,
     )
+
+
+def _determined(solution: Solution, K: Float, D: Float) -> tuple[Float, Float, Float]:
+    """Return K and D in gauge `lower` and J^T J of the nine parameters, less what temperature slopes take of it."""
+    nine, point = solution.plain.in_lower(K, D)
+    information = nine.information(point)
+    loss = 0.0 if solution.slopes is None else solution.slopes.loss
+    return *nine.parameters(point), information - loss
+
+
+def _first_sight(
+    solution: Solution, observability: Observability, information: Float, found: tuple[Float, Float]
+) -> tuple[Observability, Float, tuple[Float, Float]]:
+    """Return the observability that verdicts are explained with, the information, and the sensors' K and D.
+
+    Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
+    nearest sphere then sees the attitudes better than the fit does.
+    """
+    sphere = np.array([source == "sphere" for source in solution.stated.start.sources])
+    if not sphere.any():
+        return observability, information, found
+    held = None if solution.stated.settings.misalignment else ALIGNED
+    K, D = solution.cost.parameters(np.zeros_like(solution.x))
+    nine, point = solution.plain.in_lower(K, D)
+    round_information = nine.information(point)
+    view = Observability.of(round_information, solution.sample.poses, held)
+    sphere &= np.array([verdict == "undetermined" for verdict in view.verdicts])
+    square = sphere[:, None, None]
+    sight = np.where(square, K, found[0]), np.where(sphere[:, None], D, found[1])
+    return observability.replaced(sphere, view), np.where(square, round_information, information), sight
+
+
+def _noise_ratio(variance: Float, expected: Float, freedom: Int) -> tuple[Float, Float]:
+    """Return s over the noise of an expected variance, and the p-value of so large a ratio, shape (R,), or NaN."""
+    known = np.flatnonzero((freedom > 0) & (variance > 0) & (expected > 0))
+    ratio, p = np.full((2, len(variance)), np.nan)
+    ratio[known] = np.sqrt(variance[known]) / np.sqrt(expected[known])
+    p[known] = chi_square_chance(freedom[known] * ratio[known] ** 2, freedom[known])
+    return ratio, p
 
 
 def _absorbed(solution: Solution, observability: Observability) -> Float:
@@ -280,10 +309,10 @@ def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
     g, noise, sensors = settings.g, _robust(solution), len(solution.sample)
     centre = solution.stated.start.box.centre
     nominal, bias, words = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
-    raw = modulus_errors(sample, nominal[..., None] * np.eye(3), bias, g)
+    raw = sample.errors(nominal[..., None] * np.eye(3), bias, g)
     sums: list[Float] = []
     parts: list[list[Float]] = []
-    for (first, e, f), (_, e_raw, _) in zip(modulus_errors(sample, K, D, g), raw, strict=True):
+    for (first, e, f), (_, e_raw, _) in zip(sample.errors(K, D, g), raw, strict=True):
         real = sample.real(first, e.shape[1])
         w = real.astype(float) if weights is None else weights[:, first : first + e.shape[1]]
         psi: Float = np.zeros((sensors, 1))
@@ -506,62 +535,3 @@ def firm(dop: Float, verdict: Sequence[Verdict], s: Float, g: float) -> Bool:
     bend = error.max(axis=1, keepdims=True) ** 2 / (2.0 * g)
     poor = np.array([word == "undetermined" for word in verdict], dtype=bool)
     return np.where(poor[:, None], bounded & (error >= bend), True)
-
-
-def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float) -> tuple[Float, Float]:
-    """Return one-sigma of K_a in a gauge, shape (..., 3, 3), and of D_a, shape (..., 3).
-
-    Args:
-        K: K_a in `gauge`, shape (..., 3, 3); K_lower: the same sensors in gauge `lower`.
-        covariance: of the nine parameters, (m/s^2)^2, shape (..., 9, 9).
-        gauge: `lower`, `upper` or `symmetric`; in `full` the free rotation moves every entry of K_a, the diagonal to
-            second order, and they come out as NaN.
-        g: local gravity, m/s^2.
-    """
-    variance = np.einsum("...pp->...p", covariance)
-    sigma_D = np.sqrt(variance[..., BIAS]) * np.einsum("...ii->...i", K_lower)
-    if gauge == "full":
-        return np.full(K.shape, np.nan), sigma_D
-    chain = gauge_chain(K, K_lower, gauge, g)
-    lost = np.isnan(variance[..., :6])
-    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance[..., :6, :6]), chain)
-    size = np.abs(chain)
-    felt = size > 1e-9 * size.max(axis=(-1, -2), keepdims=True)
-    touched = (felt & lost[..., None, :]).any(axis=-1)
-    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(square, 0.0))).reshape(K.shape)
-    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
-    # A zero of the gauge has no error.
-    return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
-
-
-def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
-    """Return d K / d parameters, shape (..., 9, 6): entries of K_a in a gauge by the first six of the nine parameters.
-
-    A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
-    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
-    W leaves the body frame unturned.
-    """
-    R = np.linalg.solve(K, K_lower)
-    turned = [K @ _skew(axis) for axis in np.eye(3)]
-    turns = np.stack([_conditions(change, gauge) for change in turned], axis=-1)
-    columns = []
-    for i, j in ROWS_COLUMNS[:6]:
-        moved = R[..., :, i, None] * R[..., None, :, j] / g  # R E R^T
-        change = -0.5 * K @ (moved + moved.swapaxes(-1, -2))
-        if gauge != "full":
-            angle = np.linalg.solve(turns, -_conditions(change, gauge)[..., None])
-            for k, turn in enumerate(turned):
-                change = change + angle[..., k, :, None] * turn
-        columns.append(change.reshape(*K.shape[:-2], 9))
-    return np.stack(columns, axis=-1)
-
-
-def _conditions(change: Float, gauge: str) -> Float:
-    """Return what must vanish for a change of K to stay in the gauge, shape (..., 3)."""
-    above, below = change[..., [0, 0, 1], [1, 2, 2]], change[..., [1, 2, 2], [0, 0, 1]]
-    return {"lower": above, "upper": below}.get(gauge, above - below)
-
-
-def _skew(axis: Float) -> Float:
-    x, y, z = axis
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

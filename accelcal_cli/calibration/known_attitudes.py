@@ -70,6 +70,7 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     modulus = np.linalg.norm(force, axis=1) - np.linalg.norm(f, axis=1)
     value = np.array([np.sum((g * g - np.einsum("ji,ji->j", force, force)) ** 2)])
     ones = np.ones(1, dtype=np.int64)
+    columns = Observability(cofactor[None], dop[None], dop[None], np.array([4]), NAMES)
     return Fit(
         sample=sample,
         settings=settings,
@@ -81,9 +82,11 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         sigma_K=(s * np.outer(size, dop[:3]) / g)[None],
         sigma_D=(s * size * dop[3])[None],
         value=value,
-        observability=Observability(cofactor[None], dop[None], dop[None], np.array([4]), NAMES),
+        observability=columns,
+        view=columns,
         dop=np.sqrt(np.diagonal(nine))[None],
         information=np.linalg.pinv(nine)[None],
+        sight=(low[None], D[None]),
         freedom=np.array([freedom]),
         s=np.array([s]),
         covariance=s**2 * nine[None],
@@ -93,7 +96,8 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         before=before,
         nominal=nominal,
         residuals=_residuals(error, w, leverage, float(s), freedom, modulus, raw, force),
-        expected=np.array([np.nan]),
+        noise_ratio=np.array([np.nan]),
+        noise_p=np.array([np.nan]),
         notes=_notes(sample),
     )
 

@@ -10,6 +10,7 @@ Which poses of a log have the same attitude.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
 ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
 """Which K_ij each unknown is: diagonal, below it, above it (the last three in gauge `full` alone)."""
@@ -159,6 +161,21 @@ class Observability:
             for worst, rank in zip(self.worst.tolist(), self.rank.tolist(), strict=True)
         ]
 
+    def in_words(self, whose: str, suggestions: Sequence[str]) -> tuple[str, ...]:
+        """Return what is not determined, what is weak, and what to add, in sentences. One set of poses."""
+        lines = []
+        lost = self.above(UNDETERMINED)
+        if lost:
+            lines.append(f"{whose} do not determine: {', '.join(lost)}.")
+        elif self.rank < len(self.names):
+            lines.append(f"{whose} do not determine all nine parameters.")
+        weak = [name for name in self.above(WEAK) if name not in lost]
+        if weak:
+            lines.append(f"Weakly determined: {', '.join(weak)}.")
+        if lines and suggestions:
+            lines.append("Add these poses: " + "; ".join(suggestions) + ".")
+        return tuple(lines)
+
     def above(self, limit: float) -> list[str]:
         """Return the names of the parameters whose bounded dilution is above `limit`, worst first. One set of poses."""
         order = np.argsort(-np.round(self.bounded, 3), kind="stable")
@@ -193,12 +210,31 @@ def attitudes(u: Float, n: NDArray[np.int64], angle: float) -> list[Int]:
     return groups
 
 
+FEWEST_POSES = 12
+"""Suggested poses bring a poor set to at least this many: nine fit exactly and say nothing of their noise."""
+
+COMFORTABLE, MOST_SUGGESTIONS = 5.0, 8
+"""Suggested poses bring every dilution of precision to this, half of what counts as weak; and how many they are."""
+
 SUM_WEIGHT = 1e-3
 """Weight of the sum of the variances beside the largest one: it decides between sets alike in the largest."""
 
 
 DIGITS = 9
 """Decimals of a score: rounding decides between equal candidates otherwise, and with it the machine."""
+
+
+def poses_to_add(information: Float, poses: int, *, aligned: bool) -> tuple[str, ...]:
+    """Return the poses to hold next that bring every dilution of precision to COMFORTABLE, in words.
+
+    Args:
+        information: J^T J of the poses so far, shape (9, 9); poses: how many they are.
+        aligned: whether the axes are taken as perpendicular: faces suffice then.
+    """
+    candidates = faces() if aligned else fixture_directions()
+    known = knowing(information, ALIGNED) if aligned else information
+    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
+    return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
 
 
 def next_poses(
@@ -236,3 +272,62 @@ def _score(variances: Float, power: float) -> Float:
         score = score + np.log(((variances / largest[..., None]) ** power).sum(axis=-1)) / power
     total = SUM_WEIGHT * np.log(variances.sum(axis=-1))
     return np.asarray(np.round(np.round(score, DIGITS) + total, DIGITS))
+
+
+def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float) -> tuple[Float, Float]:
+    """Return one-sigma of K_a in a gauge, shape (..., 3, 3), and of D_a, shape (..., 3).
+
+    Args:
+        K: K_a in `gauge`, shape (..., 3, 3); K_lower: the same sensors in gauge `lower`.
+        covariance: of the nine parameters, (m/s^2)^2, shape (..., 9, 9).
+        gauge: `lower`, `upper` or `symmetric`; in `full` the free rotation moves every entry of K_a, the diagonal to
+            second order, and they come out as NaN.
+        g: local gravity, m/s^2.
+    """
+    variance = np.einsum("...pp->...p", covariance)
+    sigma_D = np.sqrt(variance[..., BIAS]) * np.einsum("...ii->...i", K_lower)
+    if gauge == "full":
+        return np.full(K.shape, np.nan), sigma_D
+    chain = gauge_chain(K, K_lower, gauge, g)
+    lost = np.isnan(variance[..., :6])
+    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance[..., :6, :6]), chain)
+    size = np.abs(chain)
+    felt = size > 1e-9 * size.max(axis=(-1, -2), keepdims=True)
+    touched = (felt & lost[..., None, :]).any(axis=-1)
+    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(square, 0.0))).reshape(K.shape)
+    exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
+    # A zero of the gauge has no error.
+    return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
+
+
+def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
+    """Return d K / d parameters, shape (..., 9, 6): entries of K_a in a gauge by the first six of the nine parameters.
+
+    A change E of the inverse matrix in gauge `lower` moves K by -K (R E R^T - W), R = K^-1 K_lower, where the
+    small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
+    W leaves the body frame unturned.
+    """
+    R = np.linalg.solve(K, K_lower)
+    turned = [K @ _skew(axis) for axis in np.eye(3)]
+    turns = np.stack([_conditions(change, gauge) for change in turned], axis=-1)
+    columns = []
+    for i, j in ROWS_COLUMNS[:6]:
+        moved = R[..., :, i, None] * R[..., None, :, j] / g  # R E R^T
+        change = -0.5 * K @ (moved + moved.swapaxes(-1, -2))
+        if gauge != "full":
+            angle = np.linalg.solve(turns, -_conditions(change, gauge)[..., None])
+            for k, turn in enumerate(turned):
+                change = change + angle[..., k, :, None] * turn
+        columns.append(change.reshape(*K.shape[:-2], 9))
+    return np.stack(columns, axis=-1)
+
+
+def _conditions(change: Float, gauge: str) -> Float:
+    """Return what must vanish for a change of K to stay in the gauge, shape (..., 3)."""
+    above, below = change[..., [0, 0, 1], [1, 2, 2]], change[..., [1, 2, 2], [0, 0, 1]]
+    return {"lower": above, "upper": below}.get(gauge, above - below)
+
+
+def _skew(axis: Float) -> Float:
+    x, y, z = axis
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

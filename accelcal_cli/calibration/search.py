@@ -9,43 +9,16 @@ J - 9 [paule1982].
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.observability import Observability
-from accelcal_cli.calibration.problem import (
-    Box,
-    Loetters,
-    Triangle,
-    compress,
-    fit_ellipsoid,
-    least_squares,
-    pack,
-)
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.calibration.problem import Loetters, Start, compress, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.settings import BoxSettings, Robust, Settings
-from accelcal_cli.optimization.minimize import Run, minimize
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.sensor.model import to_gauge
-
-SHIFT = 0.5
-"""The box is moved off the closed form by up to this part of its half-width: the search finds the answer by
-itself, and the answer stays well inside."""
-
-SPHERE_PRIOR = 1e-3
-"""Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what axes
-whose scale factors differ by 3 % pretend to say about an axis that the poses do not turn through."""
-
-HUBER = 1.345
-"""Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
-
-NORMAL_MAD = 1.4826
-"""Standard deviation of normal noise over its median absolute deviation."""
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.optimization.minimize import Run, minimize, polish
 
 SAME_MINIMUM = 1e-6
 """Two searches ended in the same minimum when their polished costs differ by at most this part."""
@@ -60,8 +33,6 @@ digits, and no accelerometer is as quiet."""
 REWEIGHTINGS, SETTLED = 50, 1e-9
 """Robust rounds at most, about ten are the rule; and the step, in half-widths of the box, that ends them."""
 
-SCALE_SAMPLE = 100_000
-"""At most about this many residuals decide the scale of a robust loss."""
 
 SHARED_ROUNDS, SHARED_SETTLED = 10, 0.01
 """Rounds of weights and fit at most, three or four are the rule; and the relative change of m^2 that ends them."""
@@ -71,28 +42,6 @@ LEAST_SHARED = 0.01
 
 SLOPES = 6
 """Parameters more where scale factors and biases are linear in temperature."""
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where searches start.
-
-    Attributes:
-        box: the search box of each of R sensors, D = 6, 9 or 12.
-        sources: of each: "stated", "closed form" or "sphere".
-    """
-
-    box: Box
-    sources: tuple[str, ...]
-
-    @property
-    def source(self) -> str:
-        """That of the first sensor."""
-        return self.sources[0]
-
-    def take(self, index: Int) -> Start:
-        """Return the starts of the sensors at `index`."""
-        return Start(self.box.take(index), tuple(self.sources[i] for i in index))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,112 +134,10 @@ class Solution:
 
 def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
-    if settings.weights == "auto":
-        return _shared(sample, settings)
-    return _stated(sample, settings, sample.weights(settings.weights))
-
-
-def _stated(sample: Sample, settings: Settings, weights: Float | None) -> Stated:
-    triangle = packed(sample, weights)
-    start = search_box(triangle, settings)
-    return Stated(sample, settings, weights, Loetters(triangle, settings.g, start.box), start)
-
-
-def packed(sample: Sample, weights: Float | None, within: Sample | None = None) -> Triangle:
-    """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
-    extent = within or sample
-    centre = 0.5 * (extent.lower + extent.upper)
-    scale = 0.5 * (extent.upper - extent.lower).max(axis=1)
-    blocks = (
-        (block, None if weights is None else weights[:, first : first + block.shape[1]])
-        for first, block in sample.blocks()
-    )
-    return compress(blocks, centre, scale, sample.poses)
-
-
-def search_box(triangle: Triangle, settings: Settings) -> Start:
-    """Return the search box of each sensor; the same in any company.
-
-    Args:
-        triangle: the compressed readings of R sensors.
-        settings: stated nominal, half-widths, gauge, seed.
-    """
-    unknowns = 6 if not settings.misalignment else 12 if settings.gauge == "full" else 9
-    sensors = len(triangle.scale)
-    if settings.nominal is not None:
-        K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))
-        D = np.broadcast_to(settings.nominal.bias, (sensors, 3))
-        return Start(_box(K, D, settings, unknowns), ("stated",) * sensors)
-    K, D = _closed_form(triangle, settings.g)
-    index = np.flatnonzero(np.isfinite(K).all(axis=(1, 2)))
-    index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
-    closed = np.zeros(sensors, dtype=bool)
-    closed[index] = True
-    sphere_K, sphere_D = _sphere(triangle, settings.g)
-    if unknowns == 12:
-        # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
-        K[index] = to_gauge(K[index], "symmetric")
-    K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
-    box = _box(K, D, settings, unknowns)
-    u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
-    moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
-    return Start(
-        Box(np.where(closed[:, None], moved, box.centre), box.half),
-        tuple("closed form" if c else "sphere" for c in closed),
-    )
-
-
-def _box(K: Float, D: Float, settings: Settings, unknowns: int) -> Box:
-    half = half_widths(np.einsum("rii->ri", K), settings.box, settings.g, unknowns)
-    return Box(pack(K, D, unknowns), half)
-
-
-def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
-    K, d = fit_ellipsoid(triangle)
-    return K * triangle.scale[:, None, None] / g, d * triangle.scale[:, None] + triangle.centre
-
-
-def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> Bool:
-    """Whether the poses determine what the closed form says, shape (R,); where they do not, noise has decided it."""
-    problem = Loetters(triangle, settings.g, _box(K, D, settings, 9))
-    seen = Observability.of(problem.information(np.zeros((len(K), 9))), triangle.poses)
-    return np.array([verdict != "undetermined" for verdict in seen.verdicts], dtype=bool)
-
-
-def _sphere(triangle: Triangle, g: float) -> tuple[Float, Float]:
-    """Return K, shape (R, 3, 3), and D, shape (R, 3), of the spheres nearest to readings that fix no ellipsoid.
-
-    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant. A direction that the poses do not turn through
-    is held at the middle of the readings by the prior.
-    """
-    left, right = triangle.R[..., 6:10], triangle.R[..., :3].sum(axis=2)
-    transposed = left.swapaxes(1, 2)
-    prior = SPHERE_PRIOR * triangle.poses[:, None, None] * np.diag([1.0, 1.0, 1.0, 0.0])
-    c = np.linalg.solve(transposed @ left + prior, transposed @ right[..., None])[..., 0]
-    radius = np.sqrt(np.maximum(c[:, 3] + np.sum(c[:, :3] ** 2, axis=1), 0.0))
-    # Far from the readings' own extent, which is 1, it is noise.
-    radius = np.where((radius > 0.3) & (radius < 3.0), radius, 1.0)
-    K = (radius * triangle.scale / g)[:, None, None] * np.eye(3)
-    return K, c[:, :3] * triangle.scale[:, None] + triangle.centre
-
-
-def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Float:
-    """Return the half-widths in the units of the unknowns, shape (..., unknowns), for scale factors (..., 3)."""
-    mean = scale.mean(axis=-1, keepdims=True)
-    turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
-    return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
-
-
-def modulus_errors(sample: Sample, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
-    """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).
-
-    K, shape (R, 3, 3), and D, shape (R, 3), are those of the sensors.
-    """
-    K_A = np.linalg.inv(K)
-    for first, block in sample.blocks():
-        # Columns of contiguous memory: ten times as fast as rows of three for many poses.
-        f = K_A @ np.subtract(block.swapaxes(1, 2), D[..., None], order="C")
-        yield first, (g * g - np.einsum("rij,rij->rj", f, f)) / (2.0 * g), f.swapaxes(1, 2)
+    weights = None if settings.weights == "auto" else sample.weights(settings.weights)
+    cost, start = opened(sample, settings, weights)
+    stated = Stated(sample, settings, weights, cost, start)
+    return _shared(stated) if settings.weights == "auto" else stated
 
 
 def search(stated: Stated, *, closed: bool = False) -> Solution:
@@ -338,10 +185,7 @@ def _tiled(cost: Loetters, sensors: int, runs: int) -> Loetters:
 def _closed(stated: Stated) -> Run:
     """Return one run per sensor at the least cost where the readings give it, else from a search."""
     cost, settings = stated.cost, stated.settings
-    triangle = cost.triangle
-    K, d = least_squares(triangle)
-    K = K * triangle.scale[:, None, None] / cost.g
-    x = cost.coordinates(K, d * triangle.scale[:, None] + triangle.centre)
+    x = cost.least_cost()
     inside = np.isfinite(x).all(axis=1) & (np.abs(np.nan_to_num(x)) < 1.0).all(axis=1)
     lacking = np.flatnonzero(~inside | np.array([source == "sphere" for source in stated.start.sources]))
     evaluations = np.zeros(len(x), dtype=np.int64)
@@ -361,12 +205,6 @@ def rounding(cost: Loetters) -> Float:
     return np.asarray(ROUNDING * cost.triangle.poses * cost.g**4)
 
 
-def polish(cost: Loetters, x: Float) -> Run:
-    """Return Levenberg-Marquardt runs from x, shape (R, D), inside the box."""
-    solver = OPTIMIZERS.get("levenberg-marquardt")()
-    return minimize(cost, solver, runs=len(x), start=x[:, None, :], trace=False)
-
-
 def reweight(solution: Solution) -> Solution:
     """Solve again under the robust loss, if there is one: weights from the residuals, residuals from the weights."""
     settings, sample = solution.stated.settings, solution.stated.sample
@@ -374,11 +212,11 @@ def reweight(solution: Solution) -> Solution:
         return solution
     for _ in range(REWEIGHTINGS):
         K, D = solution.cost.parameters(solution.x)
-        noise = _noise_scale(sample, K, D, settings.g)
+        noise = sample.noise(K, D, settings.g)
         if (noise <= NO_NOISE * settings.g).all():  # noise-free readings: every weight is 1
             return replace(solution, noise=noise)
         triangle = solution.cost.triangle
-        blocks = _robust_blocks(solution, K, D, noise)
+        blocks = sample.reweighted(K, D, settings, noise, solution.stated.weights)
         triangle = compress(blocks, triangle.centre, triangle.scale, triangle.poses)
         before, cost = solution.x, Loetters(triangle, settings.g, solution.cost.box)
         solution = replace(solution.solved_anew(cost), noise=noise)
@@ -387,51 +225,16 @@ def reweight(solution: Solution) -> Solution:
     return solution
 
 
-def _noise_scale(sample: Sample, K: Float, D: Float, g: float) -> Float:
-    """Return a robust standard deviation of e, m/s^2, shape (R,): its median absolute value times 1.4826."""
-    poses = int(sample.poses.max())
-    stride = max(1, poses // SCALE_SAMPLE)
-    sizes = [np.abs(e)[:, (-first) % stride :: stride] for first, e, _ in modulus_errors(sample, K, D, g)]
-    # Nine parameters follow the smallest residuals: the factor gives the scale back what they took.
-    freedom = max(1.0, poses - 9.0) / poses
-    return np.asarray(NORMAL_MAD * np.median(np.concatenate(sizes, axis=1), axis=1) / np.sqrt(freedom))
-
-
-def _robust_blocks(
-    solution: Solution, K: Float, D: Float, noise: Float
-) -> Iterator[tuple[Float, Float | None]]:
-    """Yield readings with their robust weights, block by block."""
-    settings, sample, weights = solution.stated.settings, solution.stated.sample, solution.stated.weights
-    errors = modulus_errors(sample, K, D, settings.g)
-    for (first, block), (_, e, _) in zip(sample.blocks(), errors, strict=True):
-        own: Float | float = 1.0 if weights is None else weights[:, first : first + e.shape[1]]
-        yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
-
-
-def loss_weight(z: Float, loss: Robust) -> Float:
-    """Return the weight psi(z) / z of residuals z in units of the noise, same shape."""
-    if loss == "huber":
-        return HUBER / np.maximum(np.abs(z), HUBER)
-    return 1.0 / np.sqrt(1.0 + z * z)  # soft-L1: rho = 2 (sqrt(1 + z^2) - 1)
-
-
-def loss_slope(z: Float, loss: Robust) -> Float:
-    """Return psi'(z), same shape."""
-    if loss == "huber":
-        return (np.abs(z) <= HUBER).astype(float)
-    return (1.0 + z * z) ** -1.5
-
-
-def _shared(sample: Sample, settings: Settings) -> Stated:
-    """State the problem with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
-    stated = _stated(sample, settings, None)
+def _shared(stated: Stated) -> Stated:
+    """State a problem anew with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
+    sample, settings = stated.sample, stated.settings
     if sample.poses.max() <= 9 or sample.count is None or sample.scatter is None:
         return stated
     before = -1.0
     for _ in range(SHARED_ROUNDS):
         x = polish(stated.cost, np.zeros_like(stated.cost.box.centre)).x
         K, D = stated.cost.parameters(x)
-        parts = list(modulus_errors(sample, K, D, settings.g))
+        parts = list(sample.errors(K, D, settings.g))
         errors, force = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
         own = sample.explained(0, force, K)
         shared = shared_variance(errors[0], own[0], int(sample.poses[0]) - 9)
@@ -439,7 +242,9 @@ def _shared(sample: Sample, settings: Settings) -> Stated:
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
         before, weights = shared, 1.0 / (shared + own)
-        stated = _stated(sample, settings, weights / weights.mean())
+        weights = weights / weights.mean()
+        cost, start = opened(sample, settings, weights)
+        stated = Stated(sample, settings, weights, cost, start)
     return stated
 
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK
-from accelcal_cli.calibration.problem import Loetters
+from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.search import SLOPES, Slopes, Solution, packed
+from accelcal_cli.calibration.search import SLOPES, Slopes, Solution
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
 SMALLEST_RANGE = 5.0

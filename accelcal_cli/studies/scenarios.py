@@ -13,12 +13,22 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress_each, fit_ellipsoid, pack
+from accelcal_cli.calibration.problem import (
+    SHIFT,
+    Box,
+    Loetters,
+    Triangle,
+    compress_each,
+    fit_ellipsoid,
+    half_widths,
+    pack,
+    packed,
+)
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import SHIFT, half_widths, packed, polish
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.sensor.model import ARCSEC, MICRO_G, PPM, ErrorModel, to_gauge, triangular
 from accelcal_cli.sensor.poses import directions

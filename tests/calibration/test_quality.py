@@ -10,8 +10,8 @@ from simulated import DPSO, MEMS, dpso_box, loetters, rotation
 
 from accelcal_cli.calibration import observability as quality
 from accelcal_cli.calibration.assess import poorly_determined
-from accelcal_cli.calibration.fit import firm, propagate
-from accelcal_cli.calibration.observability import PARAMETERS, Observability, design
+from accelcal_cli.calibration.fit import firm
+from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, propagate
 from accelcal_cli.calibration.problem import Box, pack
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
