@@ -20,7 +20,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
 from accelcal_cli.calibration.search import NO_NOISE
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.errors import ConfigError
+from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.fleet import FleetReadings
 from accelcal_cli.sensor import model as units
 
@@ -119,6 +119,7 @@ def calibrate_fleet(
 
     Raises:
         ConfigError: settings that are not for a fleet.
+        DataError: not one sensor gives the weights asked for.
     """
     check_settings(settings)
     parts = []
@@ -137,9 +138,12 @@ def calibrate_fleet(
                 for at, number in enumerate(batch.sensors.tolist()):
                     keep(number, record(assessment, at))
     order = np.argsort(np.concatenate([part.number for part in parts]))
-    return Fleet(
+    fleet = Fleet(
         **{f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(Fleet)}
     )
+    if all(reason.startswith("--weights") for reason in fleet.reason):
+        raise DataError(f"{readings.source}: no sensor can be weighted: {fleet.reason[0].rstrip('.')}")
+    return fleet
 
 
 def _part(assessment: Assessment, number: Int) -> Fleet:

@@ -207,18 +207,30 @@ def test_weights_are_those_of_calibrate(tmp_path, weights):
 
 def test_weights_that_a_sensor_lacks_are_refused_with_its_name(tmp_path):
     path = write(tmp_path / "a.csv", {"left": rows_of(poses.turns(), 1)})
-    fleet = calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="n"))
-    assert fleet.verdict[0] == FAILED
-    assert fleet.reason[0] == '--weights n needs a column "n" or repeated readings per pose.'
+    with pytest.raises(DataError, match='no sensor can be weighted: --weights n needs a column "n"'):
+        calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="n"))
+
+
+def test_a_sensor_that_gives_no_weights_fails_alone(tmp_path):
+    """The others are calibrated as if it were not there."""
+    rows = np.column_stack([rows_of(poses.turns(), 1), np.full((len(poses.turns()), 4), 2.0)])
+    without = rows.copy()
+    without[5, 4:] = 0.0
+    path = write(tmp_path / "a.csv", {"left": rows, "right": without}, "sensor,ax,ay,az,n,sx,sy,sz")
+    fleet = calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
+    assert fleet.verdict.tolist() == ["good", FAILED]
+    assert fleet.reason[1].startswith("--weights sd needs standard deviations above zero")
+    alone = write(tmp_path / "b.csv", {"left": rows}, "sensor,ax,ay,az,n,sx,sy,sz")
+    one = calibrate_fleet(read_fleet([alone]), dataclasses.replace(LM, weights="sd"))
+    np.testing.assert_array_equal(fleet.K_a[0], one.K_a[0])
 
 
 def test_a_standard_deviation_of_zero_is_no_weight(tmp_path):
     rows = np.column_stack([rows_of(poses.turns(), 1), np.full((len(poses.turns()), 4), 2.0)])
     rows[3, 4:] = 0.0
     path = write(tmp_path / "a.csv", {"stuck": rows}, "sensor,ax,ay,az,n,sx,sy,sz")
-    fleet = calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
-    assert fleet.verdict[0] == FAILED
-    assert re.match(r"--weights sd needs .* above zero", fleet.reason[0])
+    with pytest.raises(DataError, match=r"--weights sd needs .* above zero"):
+        calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
 
 
 def test_the_least_cost_of_the_ellipsoid_is_where_the_gradient_vanishes():

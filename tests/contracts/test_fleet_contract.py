@@ -113,7 +113,7 @@ def _flat(rng: np.random.Generator) -> np.ndarray:
 KINDS: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, float]]] = {
     "complete": lambda rng: (_some(rng, 12, 40), 10 ** rng.uniform(-3, -1.5)),
     "degenerate": lambda rng: (_flat(rng), 10 ** rng.uniform(-3, -1.5)),
-    "noisy": lambda rng: (_some(rng, 12, 30), rng.uniform(0.1, 0.6)),
+    "noisy": lambda rng: (_some(rng, 12, 30), rng.uniform(0.05, 0.3)),
     "noise-free": lambda rng: (_some(rng, 12, 30), 0.0),
     "outliers": lambda rng: (_some(rng, 14, 30), 10 ** rng.uniform(-3, -1.5)),
     "labels": lambda rng: (_some(rng, 12, 24), 10 ** rng.uniform(-3, -1.5)),
