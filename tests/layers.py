@@ -31,6 +31,26 @@ RANK = {unit: rank for rank, group in enumerate(GROUPS) for unit in group}
 SIBLINGS = GROUPS[0]
 """Units that may import others of their own group, as long as no circle comes of it."""
 
+INSIDE = {
+    "calibration": (
+        "settings",
+        "distributions",
+        "sample",
+        "observability",
+        "problem",
+        "result",
+        "search",
+        "temperature",
+        "fit",
+        "known_attitudes",
+        "assess",
+        "calibrate",
+        "fleet",
+        "apply",
+    ),
+}
+"""The files of a package in which the flow has an order, the lowest first; each imports only those before it."""
+
 ONLY_IN = {
     "typer": ("cli",),
     "click": ("cli",),
@@ -126,6 +146,7 @@ def violations(root: Path) -> list[str]:
             edges.setdefault(item.unit, set()).add(target)
             if not allowed(item.unit, target):
                 found.append(f"{item}: not a lower layer")
+        found += inside(item)
         named = {item.target, *(f"{item.target}.{name}" for name in item.names)}
         if item.at_load and item.file not in LATE and named & set(LATE.values()):
             found.append(f"{item}: loads a heavy package, to be imported where it is used")
@@ -134,6 +155,18 @@ def violations(root: Path) -> list[str]:
         if top in HEAVY and item.at_load and item.file not in LATE:
             found.append(f"{item}: heavy, to be imported where it is used")
     return found + circles(edges)
+
+
+def inside(item: Import) -> list[str]:
+    """The breach of an order inside a package, if an import is one."""
+    order = INSIDE.get(item.unit)
+    _, _, rest = item.target.partition(f"{PACKAGE}.{item.unit}.")
+    own = Path(item.file).stem
+    if order is None or not rest or own == "__init__":
+        return []
+    if own not in order or rest not in order:
+        return [f"{item}: {own if own not in order else rest} has no place in the order of {item.unit}"]
+    return [] if order.index(rest) < order.index(own) else [f"{item}: not a file before it in {item.unit}"]
 
 
 def allowed(unit: str, target: str) -> bool:
