@@ -161,7 +161,7 @@ def _may_have_cautions(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_cautions` has something to say of, or might have, shape (R,)."""
     g, s, settings = fit.settings.g, fit.s, fit.settings
     noisy = (s > LARGE * g) | (NOISE_BIAS * (s / g) ** 2 > _scale_sigma(fit))
-    noisy |= fit.noise_ratio >= MORE_THAN_NOISE
+    noisy |= fit.noise[0] >= MORE_THAN_NOISE
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
     found: Bool = noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always
@@ -183,7 +183,7 @@ def _cautions(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         return (*lines, *_turned_round(fit.K[at]))
     return (
         *lines,
-        *more_than_noise(float(fit.noise_ratio[at]), float(fit.noise_p[at])),
+        *more_than_noise(*fit.noise[:, at].tolist()),
         *_noise_bias(s, settings.g, float(_scale_sigma(fit)[at])),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),

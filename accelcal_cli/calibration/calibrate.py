@@ -111,15 +111,13 @@ def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
     fit = assessment.fit
     settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
-    K = fit.K[at]
-    K_A = np.linalg.inv(K)
-    ratio, chance = (None if np.isnan(v) else float(v) for v in (fit.noise_ratio[at], fit.noise_p[at]))
-    solution = fit.solution
+    model = ErrorModel(fit.K[at], fit.D[at])
+    ratio, chance = (None if np.isnan(v) else v for v in fit.noise[:, at].tolist())
     return Calibration(
-        K_a=K,
-        D_a=fit.D[at],
-        K_A=K_A,
-        f_0=K_A @ fit.D[at],
+        K_a=model.K,
+        D_a=model.D,
+        K_A=model.K_A,
+        f_0=model.f_0,
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
         dop=Dop.of(fit.dop[at]),
@@ -153,7 +151,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
         notes=_notes(assessment, at),
         version=__version__,
-        temperature=None if solution is None or solution.slopes is None else solution.slopes.temperature,
+        temperature=fit.temperature,
     )
 
 

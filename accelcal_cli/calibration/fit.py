@@ -20,6 +20,7 @@ from accelcal_cli.calibration.observability import (
     design,
     propagate,
 )
+from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample, loss_slope, loss_weight
 from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
@@ -99,8 +100,8 @@ class Fit:
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
         residuals: pose by pose.
-        noise_ratio, noise_p: s over the noise that the scatter within the poses predicts, and the p-value of so large a
-            ratio, shape (R,), NaN where nothing tells.
+        noise: s over the noise that the scatter within the poses predicts, and the p-value of so large a ratio, shape
+            (2, R), NaN where nothing tells.
         solution: what was fitted; None with known attitudes.
         notes: of the solution, in sentences.
     """
@@ -129,10 +130,18 @@ class Fit:
     before: list[str]
     nominal: Float
     residuals: PoseResiduals
-    noise_ratio: Float
-    noise_p: Float
+    noise: Float
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
+
+    @property
+    def temperature(self) -> Temperature | None:
+        """The slopes with temperature, where there are any."""
+        return (
+            None
+            if self.solution is None or self.solution.slopes is None
+            else self.solution.slopes.temperature
+        )
 
 
 def fit(solution: Solution) -> Fit:
@@ -146,7 +155,7 @@ def fit(solution: Solution) -> Fit:
     reading = _pass(solution, lower, own_D)
     residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
     variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
-    ratio, p = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
+    noise = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
     at_wall = _at_wall(solution.x)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
     shown = to_gauge(K, settings.gauge)
@@ -177,8 +186,7 @@ def fit(solution: Solution) -> Fit:
         before=reading.words,
         nominal=reading.nominal,
         residuals=residuals,
-        noise_ratio=ratio,
-        noise_p=p,
+        noise=noise,
         solution=solution,
         notes=solution.notes,
     )
@@ -214,13 +222,13 @@ def _first_sight(
     return observability.replaced(sphere, view), np.where(square, round_information, information), sight
 
 
-def _noise_ratio(variance: Float, expected: Float, freedom: Int) -> tuple[Float, Float]:
-    """Return s over the noise of an expected variance, and the p-value of so large a ratio, shape (R,), or NaN."""
+def _noise_ratio(variance: Float, expected: Float, freedom: Int) -> Float:
+    """Return s over the noise of an expected variance, and the p-value of so large a ratio, shape (2, R), or NaN."""
     known = np.flatnonzero((freedom > 0) & (variance > 0) & (expected > 0))
-    ratio, p = np.full((2, len(variance)), np.nan)
-    ratio[known] = np.sqrt(variance[known]) / np.sqrt(expected[known])
-    p[known] = chi_square_chance(freedom[known] * ratio[known] ** 2, freedom[known])
-    return ratio, p
+    noise = np.full((2, len(variance)), np.nan)
+    noise[0, known] = np.sqrt(variance[known]) / np.sqrt(expected[known])
+    noise[1, known] = chi_square_chance(freedom[known] * noise[0, known] ** 2, freedom[known])
+    return noise
 
 
 def _absorbed(solution: Solution, observability: Observability) -> Float:

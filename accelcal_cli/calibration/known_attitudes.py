@@ -49,17 +49,11 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         DataError: no reference, or one of another unit than g; attitudes that determine too little.
     """
     readings, g = sample.readings(0), settings.g
-    f = _reference(sample, settings, readings)[0]
-    w = np.ones(len(f)) if (weights := sample.weights(settings.weights)) is None else weights[0]
-    N = sample.output()[0]
-    F = np.concatenate([f / g, np.ones((len(f), 1))], axis=1)
-    K, D, cofactor = _solved(N, F, w, readings)
-    K = K / g
-    _check_axes(readings, N, K)
+    N, f, w = _inputs(sample, settings, readings)
+    K, D, cofactor, leverage = _solved(N, f, w, g, readings)
     error = np.linalg.solve(K, (N - f @ K.T - D).T).T  # K_a^-1 (N - K_a f - D_a), m/s^2, shape (J, 3)
     freedom = 3 * len(f) - 12
-    s = np.sqrt(np.sum((np.sqrt(w)[:, None] * error) ** 2) / freedom) if freedom > 0 else np.float64(np.nan)
-    leverage = np.minimum(w * np.einsum("ji,ik,jk->j", F, cofactor, F), 1.0)
+    s = np.sqrt(np.sum(w[:, None] * error**2) / freedom) if freedom > 0 else np.float64(np.nan)
     low = to_gauge(K, "lower")
     nine = _nine(K, low, cofactor)
     dop = np.sqrt(np.diagonal(cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
@@ -67,14 +61,13 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     nominal, bias, before = uncalibrated(np.array([size.mean()]), D[None], settings)
     raw = np.linalg.norm((N - bias) / nominal, axis=1) - g
     force = (N - D) @ np.linalg.inv(low).T
-    modulus = np.linalg.norm(force, axis=1) - np.linalg.norm(f, axis=1)
-    value = np.array([np.sum((g * g - np.einsum("ji,ji->j", force, force)) ** 2)])
-    ones = np.ones(1, dtype=np.int64)
+    length = np.linalg.norm(force, axis=1)
+    modulus, value = length - np.linalg.norm(f, axis=1), np.array([np.sum((g * g - length**2) ** 2)])
     columns = Observability(cofactor[None], dop[None], dop[None], np.array([4]), NAMES)
     return Fit(
         sample=sample,
         settings=settings,
-        search=Search("linear least squares", 1, value, ones, ones),
+        search=Search("linear least squares", 1, value, np.ones(1, np.intp), np.ones(1, np.intp)),
         gauge="full",
         K=K[None],
         D=D[None],
@@ -95,15 +88,14 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         rms_before=np.sqrt([np.mean(raw**2)]),
         before=before,
         nominal=nominal,
-        residuals=_residuals(error, w, leverage, float(s), freedom, modulus, raw, force),
-        noise_ratio=np.array([np.nan]),
-        noise_p=np.array([np.nan]),
+        residuals=_residuals(error, w, leverage, s, freedom, modulus, raw, force),
+        noise=np.full((2, 1), np.nan),
         notes=_notes(sample),
     )
 
 
-def _reference(sample: Sample, settings: Settings, readings: Readings) -> Float:
-    """Return the known specific force, shape (1, J, 3), once it is sure to be usable."""
+def _inputs(sample: Sample, settings: Settings, readings: Readings) -> tuple[Float, Float, Float]:
+    """Return outputs and known specific force, shape (J, 3), and weights, shape (J,), if they are usable."""
     if sample.reference is None:
         raise DataError(
             f"{readings.source}: --attitudes known needs the specific force of every pose: fx, fy, fz"
@@ -114,14 +106,17 @@ def _reference(sample: Sample, settings: Settings, readings: Readings) -> Float:
             f"{readings.source}: the reference specific force has a mean length of {length:.6g}, and g is "
             f"{settings.g:.6g}; state the g of its unit with --g"
         )
-    return sample.reference
+    weights = sample.weights(settings.weights)
+    w = np.ones(len(sample.reference[0])) if weights is None else weights[0]
+    return sample.output()[0], sample.reference[0], w
 
 
-def _solved(N: Float, F: Float, w: Float, readings: Readings) -> tuple[Float, Float, Float]:
-    """Return K g, D and (F^T W F)^-1, shape (4, 4).
+def _solved(N: Float, f: Float, w: Float, g: float, readings: Readings) -> tuple[Float, Float, Float, Float]:
+    """Return K, D, (F^T W F)^-1, shape (4, 4), and leverages, shape (J,), if attitudes and axes determine them.
 
-    N: outputs, shape (J, 3); F: rows [f 1], f the specific force in g, shape (J, 4); w: weights, shape (J,).
+    N: outputs, f: specific force, m/s^2, shape (J, 3); w: weights, shape (J,). F: rows [f 1], f in g, shape (J, 4).
     """
+    F = np.column_stack([f / g, np.ones(len(f))])
     root = np.sqrt(w)[:, None]
     values, vectors = np.linalg.eigh((F * root).T @ (F * root))
     rank = int((values > RANK_TOLERANCE * values[-1]).sum())
@@ -133,7 +128,10 @@ def _solved(N: Float, F: Float, w: Float, readings: Readings) -> tuple[Float, Fl
     cofactor = (vectors * (1.0 / values)) @ vectors.T
     middle = N.mean(axis=0)  # keeps the digits that a large offset would eat
     theta = cofactor @ (F * root**2).T @ (N - middle)
-    return theta[:3].T, theta[3] + middle, cofactor
+    K = theta[:3].T / g
+    _check_axes(readings, N, K)
+    leverage = np.minimum(w * np.einsum("ji,ik,jk->j", F, cofactor, F), 1.0)
+    return K, theta[3] + middle, cofactor, leverage
 
 
 def _check_axes(readings: Readings, N: Float, K: Float) -> None:
