@@ -143,13 +143,14 @@ def _worst(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
         )
         for r in order
     ]
-    return Table("Worst fit", columns, tuple(rows), _more(int((fleet.outlying != "").sum())))
+    outlying = int((fleet.outlying != "").sum())
+    note = f"Sensors with outliers: {outlying:,} (column outlying_poses of --format csv)."
+    return Table("Worst fit", columns, tuple(rows), (note,) if outlying else ())
 
 
-def _more(outlying: int) -> tuple[str, ...]:
-    if not outlying:
-        return ()
-    return (f"Sensors with outliers: {outlying:,} (column outlying_poses of --format csv).",)
+def _more(number: int, where: str = "") -> tuple[str, ...]:
+    """Return a note of the sensors that are not shown, of a number of them."""
+    return (f"And {number - SHOWN:,} more{where}.",) if number > SHOWN else ()
 
 
 def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table:
@@ -173,12 +174,11 @@ def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table
         Column("unit"),
         Column("z", format="+.1f"),
     )
-    notes = [
+    note = (
         "z: distance from the median in standard deviations of the fleet, by its median absolute deviation."
-    ]
-    if len(standouts) > SHOWN:
-        notes.append(f"And {len(standouts) - SHOWN:,} more (column stands_out of --format csv).")
-    return Table("Stand out from the fleet", columns, rows, tuple(notes))
+    )
+    more = _more(len(standouts), " (column stands_out of --format csv)")
+    return Table("Stand out from the fleet", columns, rows, (note, *more))
 
 
 def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table:
@@ -188,21 +188,19 @@ def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table
         (labels[r], 100.0 * float(fleet.s[r]) / g, fleet.outlying[r], CLAUSE.split(fleet.caution[r])[0])
         for r in order
     )
-    notes = ["s: standard deviation of one pose. Full sentences: column caution of --format csv."]
-    if len(warned) > SHOWN:
-        notes.append(f"And {len(warned) - SHOWN:,} more.")
+    note = "s: standard deviation of one pose. Full sentences: column caution of --format csv."
     columns = (
         Column("sensor"),
         Column("s", "% of g", ".3g"),
         Column("outlying poses"),
         Column("caution"),
     )
-    return Table("Cautions", columns, rows, tuple(notes))
+    return Table("Cautions", columns, rows, (note, *_more(len(warned))))
 
 
 def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
     """Return the sensors whose verdict is not good, the worst verdict first."""
     order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
     rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r].partition(ADVICE)[0]) for r in order[:SHOWN])
-    notes = (f"And {len(bad) - SHOWN:,} more.",) if len(bad) > SHOWN else ()
-    return Table("Not good", (Column("sensor"), Column("verdict"), Column("why")), rows, notes)
+    columns = (Column("sensor"), Column("verdict"), Column("why"))
+    return Table("Not good", columns, rows, _more(len(bad)))
