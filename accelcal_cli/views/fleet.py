@@ -75,23 +75,18 @@ def counts(fleet: Fleet) -> str:
 
 def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Block]:
     """Return what a fleet shows: how many sensors of each verdict, then what is worth knowing."""
-    return [Paragraph(heading=counts(fleet)), BLANK, *summary(fleet, labels, standouts, g)]
-
-
-def summary(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Table]:
-    """Return what a person wants to know of a fleet, in reading order."""
-    tables = []
+    shown: list[Block] = [Paragraph(heading=counts(fleet)), BLANK]
     if fleet.determined.any():
-        tables += [_spread(fleet, g), _worst(fleet, labels, g)]
+        shown += [_spread(fleet, g), _worst(fleet, labels, g)]
     warned = np.flatnonzero(fleet.caution != "")
     if len(warned):
-        tables.append(_warned(fleet, labels, warned, g))
+        shown.append(_warned(fleet, labels, warned, g))
     if standouts:
-        tables.append(_standing_out(labels, standouts))
+        shown.append(_standing_out(labels, standouts))
     bad = np.flatnonzero(fleet.verdict != "good")
     if len(bad):
-        tables.append(_not_good(fleet, labels, bad))
-    return tables
+        shown.append(_not_good(fleet, labels, bad))
+    return shown
 
 
 def _spread(fleet: Fleet, g: float) -> Table:
