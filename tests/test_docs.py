@@ -29,8 +29,7 @@ import yaml
 
 from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
-from accelcal_cli.cli.main import app
-from accelcal_cli.cli.options import help_text
+from accelcal_cli.cli.main import app, help_text
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.sensor.simulation import Sensor, Spread

@@ -55,7 +55,7 @@ def test_the_wheel_holds_the_configurations(wheel):
     assert shipped
     assert shipped <= set(names)
     assert "accelcal_cli/py.typed" in names
-    assert "accelcal_cli/output/report/templates/report.html.jinja" in names
+    assert "accelcal_cli/output/templates/report.html.jinja" in names
     assert not [name for name in names if name.startswith(("tests", "docs", "configs", "benchmarks"))]
 
 

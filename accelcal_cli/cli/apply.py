@@ -57,11 +57,10 @@ def command(
     """
     from accelcal_cli.calibration.apply import Wish, prepare
     from accelcal_cli.io.reader import open_table
-    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.output.files import whole_file
 
     options.check_input(data)
-    options.check_apart([result], {"-o": output})  # the log itself may be the output
-    check_target(output)
+    options.check_files([result], {"-o": output})  # the log itself may be the output
     wish = Wish(unit, replace, prefix, tilt, noise)
     calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,8 +10,7 @@ from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.studies.benchmark import Benchmark
-    from accelcal_cli.studies.study import Record
+    from accelcal_cli.views.blocks import Block
 
 MOST = 1_000_000_000
 
@@ -87,12 +84,13 @@ def command(
     All minima are 0. Prints the spread of the cost over the runs, how many reached the tolerance and after how many
     evaluations, and ranks with a significance test when several optimizers run on several functions.
     """
-    from accelcal_cli.studies.benchmark import Benchmark
+    from accelcal_cli.studies.benchmark import Benchmark, rank
     from accelcal_cli.studies.functions import select
-    from accelcal_cli.studies.study import ALL, Budget, choose, words
+    from accelcal_cli.studies.study import ALL, Budget, choose, median_curves, words
+    from accelcal_cli.views.studies import benchmark_blocks, benchmark_table, benchmark_title, ranking_table
 
-    options.check_apart([config], {"--raw": study_options.raw, "--plot": plot})
-    running.check_plot(plot)
+    options.check_files([config], {"--raw": study_options.raw, "--plot": plot})
+    options.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
     named = words(optimizer or ())
@@ -105,32 +103,17 @@ def command(
     study, notes = study.suiting([] if ALL in named else [entry.label for entry in entries])
     options.tell(notes, study_options.quiet)
     records = study_options.run(study)
-    _show(study, records, format)
-    if plot is not None:
-        _plot(study, records, plot)
-    options.tell_written([study_options.raw, plot], study_options.quiet)
+    title, rows, curves = (
+        benchmark_title(study),
+        benchmark_table(study, records),
+        median_curves(study, records),
+    )
 
-
-def _show(study: Benchmark, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.views.studies import benchmark_table
-
-    rows = benchmark_table(study, records)
-    if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show
-        from accelcal_cli.studies.benchmark import rank
-        from accelcal_cli.studies.study import median_curves
-        from accelcal_cli.views.studies import benchmark_blocks, benchmark_title, ranking_table
-
+    def blocks() -> list[Block]:
         ranking = rank(study, records)
         further = [ranking_table(ranking)] if ranking else []
-        curves = median_curves(study, records)
-        show(benchmark_blocks(benchmark_title(study), rows, curves, study.tolerance, further))
-    sys.stdout.flush()
+        return benchmark_blocks(title, rows, curves, tolerance, further)
 
-
-def _plot(study: Benchmark, records: Sequence[Record], path: str) -> None:
-    from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.study import median_curves
-    from accelcal_cli.views.studies import benchmark_title
-
-    plot_convergence(benchmark_title(study), median_curves(study, records), study.tolerance, path)
+    options.print_result(format, lambda: rows, blocks)
+    running.draw_convergence(plot, title, curves, tolerance)
+    options.tell_written([study_options.raw, plot], study_options.quiet)

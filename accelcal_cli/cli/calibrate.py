@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
 
-BAD_VERDICT = 1
 FACES = 6
 """Fewest poses of a log without --min-poses when no misalignment is asked for."""
 SUFFIXES = (".yaml", ".yml", ".json")
@@ -137,10 +136,9 @@ def command(
     """
     from accelcal_cli.calibration.calibrate import calibrate
     from accelcal_cli.io.readings import read_readings
-    from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
     options.check_input(data)
-    options.check_apart([data, config], {"-o": output})
+    options.check_files([data, config], {"-o": output})
     _check_output(output, format)
     stated_g = gravity.stated()
     detection = options.stated(**vars(log))
@@ -163,12 +161,11 @@ def command(
         options.tell_written([output], quiet)
         if format != "table" or output == "-":  # the table shows them itself
             options.caution(data, result.cautions, quiet)
-        if stated_g is None and settings.g == STANDARD_GRAVITY:
-            options.tell_assumed_gravity(settings.g, quiet, _units_of_g(result))
+        options.tell_assumed_gravity(stated_g, settings.g, quiet, _units_of_g(result))
         if tolerance is not None and missed:
             options.tell([f"rms {result.rms:.6g} is above the tolerance {tolerance:.6g}"])
     if missed or result.verdict == "undetermined":
-        raise typer.Exit(BAD_VERDICT)
+        raise typer.Exit(options.BAD_VERDICT)
 
 
 def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Settings:
@@ -191,17 +188,14 @@ def _units_of_g(result: Calibration) -> str:
 
 
 def _check_output(output: str | None, format: str) -> None:
-    if output is None:
-        return
-    if output == "-":
-        if format != "table":
-            raise UsageError(f"-o - prints the result file; leave out --format {format}")
-        return
-    from accelcal_cli.output.files import check_target, is_stream
+    from accelcal_cli.output.files import is_stream
 
+    if output == "-" and format != "table":
+        raise UsageError(f"-o - prints the result file; leave out --format {format}")
+    if output in (None, "-"):
+        return
     if Path(output).suffix not in SUFFIXES and not is_stream(output) and not Path(output).is_dir():
         raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
-    check_target(output)
 
 
 def _show(result: Calibration, format: str, output: str | None) -> None:
@@ -216,10 +210,6 @@ def _show(result: Calibration, format: str, output: str | None) -> None:
             file.write(text.encode())
         if output == "-":
             return
-    from accelcal_cli.views.calibration import values
+    from accelcal_cli.views.calibration import blocks, values
 
-    if not options.print_data(format, result.record, lambda: values(result)):
-        from accelcal_cli.output.console import show
-        from accelcal_cli.views.calibration import blocks
-
-        show(blocks(result))
+    options.print_result(format, lambda: values(result), lambda: blocks(result), result.record)

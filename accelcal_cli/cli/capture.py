@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -75,7 +76,11 @@ def command(
     lost port end it early; the poses taken until then are kept. Exit code 1 means that the input
     ended before all poses were taken.
     """
+    from accelcal_cli.detection.capture import Capture
+    from accelcal_cli.io.serial import file_lines, port_lines, readings
     from accelcal_cli.output.files import check_target, is_stream
+    from accelcal_cli.planning.design import candidates, distinct_poses
+    from accelcal_cli.sensor.model import OUTPUT_OF_1_G
 
     options.check_choice("--fixture", fixture, options.FIXTURES[:-1])
     chosen = _columns(columns)
@@ -92,8 +97,18 @@ def command(
         raise UsageError(f'-o "{output}": exists already; expected a new name, or --overwrite')
     check_target(output)
     options.check_input(port)
-    capture = _capture(poses, fixture, round(window * rate), round(hold * rate), stated, unit)
-    _run(capture, _readings(port, baud, timeout, chosen), output, quiet)
+    allowed = candidates(fixture)
+    if poses > len(allowed):
+        raise UsageError(f"--poses {poses}: expected at most {len(allowed)} with --fixture {fixture}")
+    capture = Capture(
+        allowed[distinct_poses(allowed, poses)],
+        round(window * rate),
+        round(hold * rate),
+        *stated,
+        unit if unit in OUTPUT_OF_1_G else None,
+    )
+    lines = file_lines(sys.stdin.buffer) if port == "-" else port_lines(port, baud, timeout)
+    _run(capture, readings(lines, chosen, "<stdin>" if port == "-" else port), output, quiet)
 
 
 def _columns(text: str) -> list[int]:
@@ -135,43 +150,12 @@ def _offset(text: str | None) -> Float | None:
     return values
 
 
-def _capture(
-    poses: int,
-    fixture: str,
-    window: int,
-    hold: int,
-    stated: tuple[float | None, float | None, Float | None],
-    unit: str | None,
-) -> Capture:
-    from accelcal_cli.detection.capture import Capture
-    from accelcal_cli.planning.design import candidates, distinct_poses
-    from accelcal_cli.sensor.model import OUTPUT_OF_1_G
-
-    allowed = candidates(fixture)
-    if poses > len(allowed):
-        raise UsageError(f"--poses {poses}: expected at most {len(allowed)} with --fixture {fixture}")
-    return Capture(
-        allowed[distinct_poses(allowed, poses)],
-        window,
-        hold,
-        *stated,
-        unit if unit in OUTPUT_OF_1_G else None,
-    )
-
-
-def _readings(port: str, baud: int, timeout: float, columns: list[int]) -> Iterator[Float]:
-    from accelcal_cli.io.serial import file_lines, port_lines, readings
-
-    lines = file_lines(sys.stdin.buffer) if port == "-" else port_lines(port, baud, timeout)
-    return readings(lines, columns, "<stdin>" if port == "-" else port)
-
-
 def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) -> None:
     """Watch the readings to the end, whatever it is, and keep the poses; then say how it ended."""
     from accelcal_cli.output.live import PoseFile, Watch
 
     ending: AccelcalError | Interrupted | None = None
-    with PoseFile(output) as file:
+    with closing(PoseFile(output)) as file:
         try:
             with Watch(capture, quiet=quiet) as watch:
                 _take(capture, readings, file, watch)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,9 +15,7 @@ from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
-    from accelcal_cli.studies.compare import Comparison
     from accelcal_cli.studies.scenarios import Recording, Simulation
-    from accelcal_cli.studies.study import Record
 
 UNKNOWNS = {"lower": 9, "full": 12}
 DEFAULT = ("pso", "de", "de-pso", "levenberg-marquardt", "ellipsoid")
@@ -149,15 +146,21 @@ def command(
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
     from accelcal_cli.studies.compare import Comparison
     from accelcal_cli.studies.scenarios import SearchSpace
-    from accelcal_cli.studies.study import Budget, choose, words
+    from accelcal_cli.studies.study import Budget, choose, median_curves, words
+    from accelcal_cli.views import studies as views
 
     sensor = simulation.sensor
     type_file = sensor if sensor is not None and Path(sensor).suffix else None
-    options.check_apart([data, config, type_file], {"--raw": study_options.raw, "--plot": plot})
-    running.check_plot(plot)
+    options.check_files([data, config, type_file], {"--raw": study_options.raw, "--plot": plot})
+    options.check_plot(plot)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
-    space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, _unknowns(gauge))
+    if gauge not in UNKNOWNS:
+        raise UsageError(
+            f'--gauge "{gauge}": unknown{did_you_mean(gauge, UNKNOWNS)}; expected lower or full '
+            "(errors are always those of gauge lower)"
+        )
+    space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, UNKNOWNS[gauge])
     entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
     source: Simulation | Recording
     if data is not None:
@@ -168,19 +171,16 @@ def command(
         source = simulation.scenario()
     study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
     records = study_options.run(study)
-    _show(study, records, format)
-    if plot is not None:
-        _plot(study, records, plot)
+    title, conditions = views.comparison_subject(study), views.comparison_conditions(study)
+    rows, curves = views.comparison_table(study, records), median_curves(study, records)[""]
+    shown = {"Convergence": curves} if curves else {}
+    options.print_result(
+        format,
+        lambda: rows,
+        lambda: views.study_blocks(title, [replace(rows.filled(), title="")], shown, conditions),
+    )
+    running.draw_convergence(plot, title, {conditions: curves}, 0.0 if study.noisy else study.tolerance)
     options.tell_written([study_options.raw, plot], study_options.quiet)
-
-
-def _unknowns(gauge: str) -> int:
-    if gauge not in UNKNOWNS:
-        raise UsageError(
-            f'--gauge "{gauge}": unknown{did_you_mean(gauge, UNKNOWNS)}; expected lower or full '
-            "(errors are always those of gauge lower)"
-        )
-    return UNKNOWNS[gauge]
 
 
 def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOptions) -> Recording:
@@ -192,30 +192,3 @@ def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOp
         raise UsageError(f"{', '.join(stated)}: not with a file of readings, which are not simulated")
     options.check_input(data)
     return Recording.of(read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer), g)
-
-
-def _show(study: Comparison, records: Sequence[Record], format: str) -> None:
-    from accelcal_cli.views.experiments import comparison_table
-
-    rows = comparison_table(study, records)
-    if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show
-        from accelcal_cli.studies.study import median_curves
-        from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
-        from accelcal_cli.views.studies import study_blocks
-
-        panels = median_curves(study, records)
-        plotted = {"Convergence": panels[""]} if panels[""] else {}
-        title, note = comparison_subject(study), comparison_conditions(study)
-        show(study_blocks(title, [replace(rows.filled(), title="")], plotted, note))
-    sys.stdout.flush()
-
-
-def _plot(study: Comparison, records: Sequence[Record], path: str) -> None:
-    from accelcal_cli.output.plot import plot_convergence
-    from accelcal_cli.studies.study import median_curves
-    from accelcal_cli.views.experiments import comparison_conditions, comparison_subject
-
-    tolerance = 0.0 if study.noisy else study.tolerance
-    panels = {comparison_conditions(study): median_curves(study, records)[""]}
-    plot_convergence(comparison_subject(study), panels, tolerance, path)

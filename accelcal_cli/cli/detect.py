@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options, running
+from accelcal_cli.cli import options
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -44,24 +44,32 @@ def command(
     and the one whose poses calibrate best is kept. `calibrate --raw` does both in one.
     """
     from accelcal_cli.detection.detect import TooFewPosesError
-    from accelcal_cli.output.files import check_target
+    from accelcal_cli.output.files import whole_file
+    from accelcal_cli.output.machine import write_csv
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
+    from accelcal_cli.views import detection as views
 
     if output == "-" and format != "table":
         raise UsageError(f"-o - prints the poses as CSV; leave out --format {format}")
     if output is not None and output == plot:
         raise UsageError(f'--plot "{plot}": expected another file than --output')
-    options.check_apart([data], {"-o": output, "--plot": plot})
-    if output is not None:
-        check_target(output)
-    running.check_plot(plot)
+    options.check_files([data], {"-o": output, "--plot": plot})
+    options.check_plot(plot)
     local_g = gravity.stated() or STANDARD_GRAVITY
     try:
         detection = log.detect(data, columns, local_g, picture=plot is not None)
     except TooFewPosesError as failure:
         _draw(failure.detection, plot, quiet)
         raise
-    _show(detection, format, output)
+    poses = views.poses_table(detection)
+    if output is not None:
+        with whole_file(output) as file:
+            write_csv(poses, file)
+    if output != "-":
+        options.print_result(
+            format, lambda: poses, lambda: views.blocks(detection), lambda: views.record(detection)
+        )
+    sys.stdout.flush()
     options.tell_written([output], quiet)
     _draw(detection, plot, quiet)
 
@@ -74,21 +82,3 @@ def _draw(detection: Detection, plot: str | None, quiet: bool) -> None:
 
     plot_log(detection, plot)
     options.tell_written([plot], quiet)
-
-
-def _show(detection: Detection, format: str, output: str | None) -> None:
-    """Write the poses, then print in the chosen form."""
-    from accelcal_cli.output.files import whole_file
-    from accelcal_cli.output.machine import write_csv
-    from accelcal_cli.views.detection import poses_table, record
-
-    if output is not None:
-        with whole_file(output) as file:
-            write_csv(poses_table(detection), file)
-    printed = options.print_data(format, lambda: record(detection), lambda: poses_table(detection))
-    if not printed and output != "-":
-        from accelcal_cli.output.console import show
-        from accelcal_cli.views.detection import blocks
-
-        show(blocks(detection))
-    sys.stdout.flush()

@@ -67,7 +67,7 @@ def command(
     Warns of what the format cannot hold. PX4 and ArduPilot have no misalignments.
     """
     from accelcal_cli.exporters.base import EXPORTERS
-    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.output.files import whole_file
 
     cls = EXPORTERS.get(to)
     stated = options.stated(**vars(target))
@@ -78,8 +78,7 @@ def command(
                 f"--{option.replace('_', '-')} does not apply to --to {to}; it applies to {', '.join(takers)}"
             )
     exporter = EXPORTERS.build(to, stated, f"--to {to}")
-    options.check_apart([result], {"-o": output})
-    check_target(output)
+    options.check_files([result], {"-o": output})
     if cls.binary and output == "-" and sys.stdout.isatty():
         raise UsageError(f"--to {to} is not text for a terminal; name a file with -o")
     calibration = options.load_result(result)

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.settings import Settings
     from accelcal_cli.io.fleet import FleetReadings
 
-BAD_VERDICT = 1
 SUFFIXES = (".csv", ".parquet", ".json")
 NAMED = 5
 """Sensors that a line on standard error names."""
@@ -93,7 +92,8 @@ def command(
     from accelcal_cli.calibration.settings import load_settings
     from accelcal_cli.config import load_mapping
     from accelcal_cli.io.fleet import read_fleet
-    from accelcal_cli.sensor.model import STANDARD_GRAVITY
+    from accelcal_cli.output.files import whole_folder
+    from accelcal_cli.output.machine import write_result
 
     for source in data:
         options.check_input(source)
@@ -112,7 +112,10 @@ def command(
     check_settings(settings)
     readings = read_fleet(data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer)
     if folder and output is not None:
-        fleet = _with_results(readings, settings, output)
+        with whole_folder(output) as results:
+            fleet = calibrate_fleet(
+                readings, settings, lambda number, one: write_result(results, readings.sensors[number], one)
+            )
     else:
         fleet = calibrate_fleet(readings, settings)
     with process.even_if_unread():
@@ -120,12 +123,11 @@ def command(
     bad = _bad(fleet, tolerance)
     with process.even_if_unread(sys.stderr):
         options.tell(dict.fromkeys(note for origin in readings.origins for note in origin.notes), quiet)
-        if stated_g is None and settings.g == STANDARD_GRAVITY:
-            options.tell_assumed_gravity(settings.g, quiet)
+        options.tell_assumed_gravity(stated_g, settings.g, quiet)
         options.tell_written([output], quiet)
         _name(bad, readings.sensors)
     if any(which.any() for which in bad.values()):
-        raise typer.Exit(BAD_VERDICT)
+        raise typer.Exit(options.BAD_VERDICT)
 
 
 def _check_output(output: str) -> bool:
@@ -143,18 +145,6 @@ def _check_output(output: str) -> bool:
     return False
 
 
-def _with_results(readings: FleetReadings, settings: Settings, output: str) -> Fleet:
-    """Calibrate, and write the result file of every sensor to a folder."""
-    from accelcal_cli.calibration.fleet import calibrate_fleet
-    from accelcal_cli.output.files import whole_folder
-    from accelcal_cli.output.machine import write_result
-
-    with whole_folder(output) as folder:
-        return calibrate_fleet(
-            readings, settings, lambda number, result: write_result(folder, readings.sensors[number], result)
-        )
-
-
 def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str, output: str | None) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
     from accelcal_cli.calibration.fleet import standouts
@@ -165,10 +155,9 @@ def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str
     rows = fleet_tables.sensors(fleet, readings.sensors, outlying)
     if output is not None:
         write_table(rows, output)
-    if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show
-
-        show(fleet_tables.blocks(fleet, readings.sensors, outlying, settings.g))
+    options.print_result(
+        format, lambda: rows, lambda: fleet_tables.blocks(fleet, readings.sensors, outlying, settings.g)
+    )
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:

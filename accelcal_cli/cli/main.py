@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import inspect
 import io
 import os
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, get_args, get_type_hints
 
 import typer
 import typer.core
 import typer.main
 
 from accelcal_cli import __version__
-from accelcal_cli.cli import options, process
+from accelcal_cli.cli import process
 from accelcal_cli.errors import AccelcalError, Interrupted
 
 BAD_INPUT, INTERRUPTED = 2, 130
+CHOICES = "{choices}"
+"""Stands in a help text for the choices that an option offers to the shell."""
 
 for library in ("OPENBLAS", "OMP", "MKL"):
     # Our matrices are small: threads only wait for each other, and a result must not depend on their number.
@@ -60,12 +65,57 @@ STYLE: dict[str, Any] = {
 def _build(name: str) -> Any:
     """Return the parsed form of one command."""
     alone = typer.Typer(add_completion=False, **STYLE)
-    alone.command(name, cls=Command)(options.expand(_function(name)))
+    alone.command(name, cls=Command)(expand(_function(name)))
     return typer.main.get_command(alone)
 
 
 def _function(name: str) -> Any:
     return import_module(f"accelcal_cli.cli.{name}").command
+
+
+def expand(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command as typer wants it: every group of options spelled out as the options themselves.
+
+    A parameter stands for a group when its type is a dataclass, or when its annotation carries a function that returns
+    one (`Annotated[Any, function]`), for options that are known only when they are asked for.
+    """
+    groups: dict[str, Any] = {}
+    spelled: dict[str, inspect.Parameter] = {}
+    hints = get_type_hints(command, include_extras=True)
+    for parameter in inspect.signature(command).parameters.values():
+        hint = hints[parameter.name]
+        makers = [part for part in get_args(hint)[1:] if inspect.isfunction(part)]
+        group = makers[0]() if makers else hint
+        if not dataclasses.is_dataclass(group):
+            spelled[parameter.name] = parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
+            continue
+        groups[parameter.name] = group
+        own = get_type_hints(group, include_extras=True)
+        for field in dataclasses.fields(group):
+            spelled[field.name] = inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=own[field.name]
+            )
+
+    def run(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{f.name: values.pop(f.name) for f in dataclasses.fields(group)})
+        command(**values)
+
+    run.__doc__ = command.__doc__
+    run.__signature__ = inspect.Signature(list(spelled.values()))  # type: ignore[attr-defined]
+    return run
+
+
+def help_text(parameter: Any, ctx: Any, text: str) -> str:
+    """Return the help of a parameter with its choices in place of {choices}.
+
+    Without the parentheses that typer puts round a default that is a text.
+    """
+    text = re.sub(r"default: \((.*)\)(?=[;\]])", r"default: \1", text)
+    if CHOICES not in text:
+        return text
+    names = [item.value for item in parameter.shell_complete(ctx, "")]
+    return text.replace(CHOICES, " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))))
 
 
 class Command(typer.core.TyperCommand):
@@ -79,7 +129,7 @@ class Command(typer.core.TyperCommand):
             if record is not None:
                 names, text = record
                 heading = getattr(parameter, "rich_help_panel", None) or "Options"
-                row = names, options.help_text(parameter, ctx, text)
+                row = names, help_text(parameter, ctx, text)
                 panels.setdefault(heading, []).append(row)
         for heading, rows in panels.items():
             with formatter.section(heading):

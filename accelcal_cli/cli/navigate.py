@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,11 +22,6 @@ ALL = "all"
 in_filters, in_voyage = options.panel("Filters"), options.panel("Voyage")
 
 
-def filters_or_all() -> list[str]:
-    """Return the names of the filters, and "all"."""
-    return [*options.filters(), ALL]
-
-
 def command(
     *,
     filter: Annotated[
@@ -37,7 +31,7 @@ def command(
             help="Filters, separated by commas or repeated: {choices}.",
             show_default="all, or the file's",
             metavar="NAMES",
-            autocompletion=options.several_of(filters_or_all),
+            autocompletion=options.several_of(lambda: [*options.filters(), ALL]),
         ),
     ] = None,
     mode: Annotated[
@@ -98,51 +92,32 @@ def command(
     Prints the position error over hours 3 to 8, the smallest that any filter could have (the posterior Cramer-Rao
     bound), how many runs lost lock, and whether the claimed spread fits the error (NEES, 2 when it does).
     """
-    running.check_plot(plot)
-    _check(mode, output, format)
+    from accelcal_cli.navigation.study import Navigation, load_study
+    from accelcal_cli.studies.study import words
+    from accelcal_cli.views.navigation import summary
+
+    options.check_plot(plot)
+    if mode is not None:
+        options.check_choice("--mode", mode, MODES)
+    if output == "-" and format != "table":
+        raise UsageError(f"-o - prints the curves; leave out --format {format}")
     setting = options.stated(map=map, voyage=voyage, period=period)
     limits = {"particles": particles, "generations": generations}
     repeats = options.stated(runs=runs, seed=seed)
-    study = _study(config, {**setting, **repeats}, filter or (), mode, limits, calibration)
-    inputs = [config, calibration, *study.settings.files()]
-    options.check_apart(inputs, {"-o": output, "--raw": study_options.raw, "--plot": plot})
-    records = study_options.run(study)
-    if output != "-":
-        _show(study, records, format)
-    _write(study, records, output, plot)
-    options.tell_written([study_options.raw, output, plot], study_options.quiet)
-
-
-def _check(mode: str | None, output: str | None, format: str) -> None:
-    if mode is not None:
-        options.check_choice("--mode", mode, MODES)
-    if output is None:
-        return
-    if output == "-" and format != "table":
-        raise UsageError(f"-o - prints the curves; leave out --format {format}")
-    from accelcal_cli.output.files import check_target
-
-    check_target(output)
-
-
-def _study(
-    config: Path | None,
-    stated: Mapping[str, Any],
-    names: Sequence[str],
-    mode: str | None,
-    limits: Mapping[str, Any],
-    calibration: str | None,
-) -> Navigation:
-    """Return the study that file and command line state together."""
-    from accelcal_cli.navigation.study import Navigation, load_study
-    from accelcal_cli.studies.study import words
-
-    settings = load_study(config, stated)
-    entries = _entries(words(names), settings.filters, mode, limits)
+    settings = load_study(config, {**setting, **repeats})
+    entries = _entries(words(filter or ()), settings.filters, mode, limits)
     grades: tuple[InsGrade, ...] = (settings.ins,)
     if calibration is not None:
         settings, grades = _calibrated(settings, calibration)
-    return Navigation(settings.with_digests(), tuple(entries), grades)
+    study = Navigation(settings.with_digests(), tuple(entries), grades)
+    inputs = [config, calibration, *study.settings.files()]
+    options.check_files(inputs, {"-o": output, "--raw": study_options.raw, "--plot": plot})
+    records = study_options.run(study)
+    rows = summary(study, records)
+    if output != "-":
+        options.print_result(format, lambda: rows, lambda: [rows])
+    _write(study, records, output, plot)
+    options.tell_written([study_options.raw, output, plot], study_options.quiet)
 
 
 def _entries(
@@ -174,25 +149,13 @@ def _calibrated(settings: NavigationSettings, source: str) -> tuple[NavigationSe
     return free, (ins, grade_of(result, ins, source))
 
 
-def _show(study: Navigation, records: Sequence[Record], format: str) -> None:
-    """Print the summary in a format."""
-    from accelcal_cli.views.navigation import summary
-
-    rows = summary(study, records)
-    if not options.print_rows(format, rows):
-        from accelcal_cli.output.console import show
-
-        show([rows])
-    sys.stdout.flush()
-
-
 def _write(study: Navigation, records: Sequence[Record], output: str | None, plot: str | None) -> None:
     """Write the curves as CSV and the picture, as far as they are wanted."""
     if output is None and plot is None:
         return
     from accelcal_cli.output.files import whole_file
     from accelcal_cli.output.machine import write_csv
-    from accelcal_cli.views.navigation import curves
+    from accelcal_cli.views.navigation import chart_of, curves
 
     table = curves(study, records)
     if output is not None:
@@ -200,6 +163,5 @@ def _write(study: Navigation, records: Sequence[Record], output: str | None, plo
             write_csv(table, file)
     if plot is not None:
         from accelcal_cli.output.plot import plot_voyage
-        from accelcal_cli.views.navigation import chart_of
 
         plot_voyage(chart_of(study, records, table), plot)

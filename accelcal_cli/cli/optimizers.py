@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated
 
 import typer
@@ -25,14 +24,12 @@ def command(
 ) -> None:
     """List the optimizers, their settings and their papers."""
     from accelcal_cli.optimization.optimizer import OPTIMIZERS
-    from accelcal_cli.output.console import show
     from accelcal_cli.output.machine import json_rows
-    from accelcal_cli.views.optimizers import catalogue, catalogue_blocks, flat, settings, settings_blocks
+    from accelcal_cli.views import studies as views
 
-    table = settings(name) if name else catalogue()
-    if not options.print_data(format, lambda: json_rows([table]), lambda: flat(table)):
-        show(settings_blocks(table) if name else catalogue_blocks(table))
-    sys.stdout.flush()
-    if not quiet:
-        for fault in OPTIMIZERS.faults.values():
-            typer.echo(f"accelcal: {fault}", err=True)
+    table = views.optimizer_settings(name) if name else views.optimizer_catalogue()
+    blocks = views.optimizer_settings_blocks if name else views.optimizer_catalogue_blocks
+    options.print_result(
+        format, lambda: views.flat_text(table), lambda: blocks(table), lambda: json_rows([table])
+    )
+    options.tell(OPTIMIZERS.faults.values(), quiet)

@@ -1,25 +1,22 @@
 """Options that several commands share, groups of options, and the checks on them.
 
 A group is a frozen dataclass whose fields are options: a command that has a parameter of such a type takes them all,
-and `expand` spells them out for typer. An option's panel is its heading in the help; what `one_of` or `several_of`
+and `main.expand` spells them out for typer. An option's panel is its heading in the help; what `one_of` or `several_of`
 offers to the shell stands in the help in place of {choices}.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import inspect
 import math
 import os
 import pkgutil
-import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,11 +26,10 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
     from accelcal_cli.table import Table
+    from accelcal_cli.views.blocks import Block
 
 Complete = Callable[[str], list[str]]
 """What the shell asks for values: from what is typed so far to what it may become."""
-
-CHOICES = "{choices}"
 
 
 def one_of(names: Iterable[str] | Callable[[], Iterable[str]]) -> Complete:
@@ -53,18 +49,6 @@ def several_of(names: Iterable[str] | Callable[[], Iterable[str]]) -> Complete:
         return [f"{before}{comma}{name}" for name in one_of(names)("")]
 
     return complete
-
-
-def help_text(parameter: Any, ctx: Any, text: str) -> str:
-    """Return the help of a parameter with its choices in place of {choices}.
-
-    Without the parentheses that typer puts round a default that is a text.
-    """
-    text = re.sub(r"default: \((.*)\)(?=[;\]])", r"default: \1", text)
-    if CHOICES not in text:
-        return text
-    names = [item.value for item in parameter.shell_complete(ctx, "")]
-    return text.replace(CHOICES, " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))))
 
 
 def classes_in(package: str, group: str) -> list[str]:
@@ -100,47 +84,14 @@ def optimizers_or_all() -> list[str]:
 
 def shipped(kind: str) -> list[str]:
     """Return the names of the shipped configurations of a kind: sensors, studies."""
-    from accelcal_cli import config
+    from accelcal_cli.config import shipped as shipped_files
 
-    return list(config.shipped(kind))
+    return list(shipped_files(kind))
 
 
 def panel(heading: str) -> Callable[..., Any]:
     """Return typer.Option for options that stand under a heading of the help."""
     return partial(typer.Option, rich_help_panel=heading)
-
-
-def expand(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command as typer wants it: every group of options spelled out as the options themselves.
-
-    A parameter stands for a group when its type is a dataclass, or when its annotation carries a function that returns
-    one (`Annotated[Any, function]`), for options that are known only when they are asked for.
-    """
-    groups: dict[str, Any] = {}
-    spelled: dict[str, inspect.Parameter] = {}
-    hints = get_type_hints(command, include_extras=True)
-    for parameter in inspect.signature(command).parameters.values():
-        hint = hints[parameter.name]
-        makers = [part for part in get_args(hint)[1:] if inspect.isfunction(part)]
-        group = makers[0]() if makers else hint
-        if not dataclasses.is_dataclass(group):
-            spelled[parameter.name] = parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
-            continue
-        groups[parameter.name] = group
-        own = get_type_hints(group, include_extras=True)
-        for field in dataclasses.fields(group):
-            spelled[field.name] = inspect.Parameter(
-                field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=own[field.name]
-            )
-
-    def run(**values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{f.name: values.pop(f.name) for f in dataclasses.fields(group)})
-        command(**values)
-
-    run.__doc__ = command.__doc__
-    run.__signature__ = inspect.Signature(list(spelled.values()))  # type: ignore[attr-defined]
-    return run
 
 
 def stated(**values: Any) -> dict[str, Any]:
@@ -150,6 +101,10 @@ def stated(**values: Any) -> dict[str, Any]:
 
 # Options of one kind in all commands
 
+BAD_VERDICT = 1
+"""Exit code of a command that did its work and found something bad."""
+
+PLOT_SUFFIXES = (".png", ".svg")
 FORMATS = ("table", "json", "csv")
 SCHEMES = ("faces", "edges", "faces-edges", "icosahedron", "turns", "fibonacci", "random")
 GAUGES = ("lower", "upper", "symmetric", "full")
@@ -396,7 +351,7 @@ def check_apart(inputs: Iterable[str | Path | None], outputs: Mapping[str, str |
 
     Args:
         inputs: files that are read, - for standard input, None for one that was not stated.
-        outputs: files to write by the option that names them.
+        outputs: files to write by the option that names them, None for one that was not stated.
     """
     read = [_identity(source) for source in inputs if source is not None]
     for option, output in outputs.items():
@@ -405,6 +360,23 @@ def check_apart(inputs: Iterable[str | Path | None], outputs: Mapping[str, str |
         written = os.stat(output)
         if any(source is not None and os.path.samestat(source, written) for source in read):
             raise UsageError(f'{option} "{output}": is the input itself; expected another name')
+
+
+def check_files(inputs: Iterable[str | Path | None], outputs: Mapping[str, str | None]) -> None:
+    """Check, before any work is done, that every output can be written and replaces no input.
+
+    Args:
+        inputs, outputs: see `check_apart`.
+
+    Raises:
+        UsageError: an output is an input.
+        OutputError: an output cannot be written.
+    """
+    from accelcal_cli.output.files import check_target
+
+    check_apart(inputs, outputs)
+    for output in filter(None, outputs.values()):
+        check_target(output)
 
 
 def _identity(source: str | Path) -> os.stat_result | None:
@@ -419,6 +391,21 @@ def check_suffix(option: str, path: str, suffixes: tuple[str, ...]) -> None:
     """Raise UsageError when the name of a file to write does not end as it should."""
     if Path(path).suffix not in suffixes:
         raise UsageError(f'{option} "{path}": expected a name that ends in {" or ".join(suffixes)}')
+
+
+def check_plot(plot: str | None) -> None:
+    """Refuse a plot that could not be written, before any run is made for it.
+
+    Raises:
+        UsageError: another suffix, or matplotlib is missing.
+    """
+    if plot is None:
+        return
+    from importlib.util import find_spec
+
+    check_suffix("--plot", plot, PLOT_SUFFIXES)
+    if find_spec("matplotlib") is None:
+        raise UsageError("--plot needs matplotlib: pip install 'accelcal[plot]'")
 
 
 def split_columns(text: str | None) -> list[str] | None:
@@ -445,28 +432,31 @@ def load_result(source: str, data: str | None = None) -> Calibration:
     return result.load_result("<stdin>", sys.stdin.buffer)
 
 
-def print_data(format: str, record: Callable[[], object], table: Callable[[], Table]) -> bool:
-    """Print what other programs read; return whether that was asked for, or else a table for people.
+def print_result(
+    format: str,
+    table: Callable[[], Table],
+    blocks: Callable[[], Iterable[Block]],
+    record: Callable[[], object] | None = None,
+) -> None:
+    """Print a result on standard output.
 
     Args:
         format: of FORMATS.
-        record: makes what json prints.
         table: makes what csv prints.
+        blocks: makes what people see.
+        record: makes what json prints; the rows of the table when None.
     """
-    from accelcal_cli.output.machine import json_text, write_csv
+    from accelcal_cli.output.machine import json_rows, json_text, write_csv
 
-    if format == "json":
-        sys.stdout.write(json_text(record()))
-    elif format == "csv":
+    if format == "table":
+        from accelcal_cli.output.console import show
+
+        show(blocks())
+    elif format == "json":
+        sys.stdout.write(json_text(record() if record else json_rows([table()])))
+    else:
         write_csv(table(), sys.stdout)
-    return format != "table"
-
-
-def print_rows(format: str, table: Table) -> bool:
-    """Print a table for other programs; return whether that was asked for."""
-    from accelcal_cli.output.machine import json_rows
-
-    return print_data(format, lambda: json_rows([table]), lambda: table)
+    sys.stdout.flush()
 
 
 def tell(notes: Iterable[str], quiet: bool = False) -> None:
@@ -485,12 +475,10 @@ def caution(source: str, cautions: Iterable[str], quiet: bool) -> None:
     tell((f"{source}: caution: {text}" for text in cautions), quiet)
 
 
-def tell_assumed_gravity(g: float, quiet: bool, further: str = "") -> None:
-    """Say on standard error that standard gravity was assumed."""
-    tell(
-        [
-            f"g = {g} assumed; state yours with --g or --latitude and --height (scale factors are proportional to it)"
-            f"{further}"
-        ],
-        quiet,
-    )
+def tell_assumed_gravity(stated: float | None, g: float, quiet: bool, further: str = "") -> None:
+    """Say on standard error, unless quiet, that standard gravity was assumed, where `g` is that and was not stated."""
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
+
+    if stated is None and g == STANDARD_GRAVITY:
+        advice = "state yours with --g or --latitude and --height (scale factors are proportional to it)"
+        tell([f"g = {g} assumed; {advice}{further}"], quiet)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 MOST_POSES = 200
 FROM_NOTHING, NEXT = 12, 6
-BAD_VERDICT = 1
 RESULTS = (".yaml", ".yml", ".json")
 """Endings of a result file; anything else holds readings."""
 
@@ -71,6 +70,8 @@ def command(
     Prints them in words and as vectors, and the sigma to expect after each. Exit code 1 means that not even all
     these poses determine the parameters.
     """
+    from accelcal_cli.views import plan as views
+
     options.check_choice("--fixture", fixture, options.FIXTURES)
     options.check_positive("--noise", noise, " in m/s^2")
     if poses is not None and add is not None:
@@ -79,12 +80,17 @@ def command(
     so_far = _so_far(data, columns, stated_g) if data is not None else None
     proposal = _plan(so_far, poses, add, fixture, noise, stated_g)
     with process.even_if_unread():
-        _show(proposal, format)
+        options.print_result(
+            format,
+            lambda: views.pose_table(proposal),
+            lambda: views.blocks(proposal),
+            lambda: views.record(proposal),
+        )
     with process.even_if_unread(sys.stderr):
         if so_far is not None and format != "table":  # the table shows them itself
             options.caution(str(data), so_far.cautions, quiet)
     if proposal.verdict == "undetermined":
-        raise typer.Exit(BAD_VERDICT)
+        raise typer.Exit(options.BAD_VERDICT)
 
 
 def _so_far(data: str, columns: str | None, g: float | None) -> Calibration:
@@ -137,16 +143,6 @@ def _plan(
     local_g = g or STANDARD_GRAVITY
     if so_far is None:
         return plan(np.zeros((9, 9)), 0, count, fixture, None if noise is None else noise / local_g)
-    known = so_far.s if so_far.freedom > 0 and so_far.s > 0 else None
-    sigma = noise or known
-    part = None if sigma is None else sigma / so_far.g
+    sigma = noise or (so_far.s if so_far.freedom > 0 else 0.0)
+    part = sigma / so_far.g if sigma > 0 else None
     return plan(so_far.information, existing, count, fixture, part, so_far)
-
-
-def _show(proposal: Plan, format: str) -> None:
-    from accelcal_cli.views.plan import blocks, pose_table, record
-
-    if not options.print_data(format, lambda: record(proposal), lambda: pose_table(proposal)):
-        from accelcal_cli.output.console import show
-
-        show(blocks(proposal))

@@ -42,12 +42,7 @@ SIGNALS = ("SIGHUP", "SIGTERM")
 
 
 class Ended(KeyboardInterrupt):
-    """A signal came; `number` is its number."""
-
-    def __init__(self, number: int) -> None:
-        """Keep the number."""
-        super().__init__()
-        self.number = number
+    """A signal came; its number is the only argument."""
 
 
 @contextmanager
@@ -73,5 +68,6 @@ def raised() -> Iterator[None]:
 def interrupted(stop: KeyboardInterrupt) -> Interrupted:
     """Return what to say of Ctrl-C or a signal, with its exit code: 128 and the number, as shells have it."""
     if isinstance(stop, Ended):
-        return Interrupted(f"ended by {signal.Signals(stop.number).name}", 128 + stop.number)
+        (number,) = stop.args
+        return Interrupted(f"ended by {signal.Signals(number).name}", 128 + number)
     return Interrupted("interrupted")

@@ -11,7 +11,6 @@ import typer
 from accelcal_cli.cli import options, process
 
 SUFFIXES = (".html", ".htm")
-BAD_VERDICT = 1
 
 
 def command(
@@ -28,13 +27,12 @@ def command(
     links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the verdict is
     "undetermined"; the report is written all the same.
     """
-    from accelcal_cli.output.files import check_target, is_stream, whole_file
-    from accelcal_cli.output.report.page import check_packages, page
+    from accelcal_cli.output.files import is_stream, whole_file
+    from accelcal_cli.output.report import check_packages, page
 
     if output != "-" and not Path(output).is_dir() and not is_stream(output):
         options.check_suffix("-o", output, SUFFIXES)
-    options.check_apart([result], {"-o": output})
-    check_target(output)
+    options.check_files([result], {"-o": output})
     check_packages()
     calibration = options.load_result(result)
     source = Path(str(calibration.data.get("source", result))).name
@@ -44,4 +42,4 @@ def command(
     with process.even_if_unread(sys.stderr):
         options.tell_written([output], quiet)
     if calibration.verdict == "undetermined":
-        raise typer.Exit(BAD_VERDICT)
+        raise typer.Exit(options.BAD_VERDICT)

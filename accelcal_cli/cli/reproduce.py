@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +15,7 @@ from accelcal_cli.errors import UsageError
 if TYPE_CHECKING:
     from accelcal_cli.studies.reproduce import Experiment
     from accelcal_cli.table import Table
+    from accelcal_cli.views.blocks import Block
 
 
 def command(
@@ -45,13 +46,15 @@ def command(
     docs/explanation/reproduction.md.
     """
     from accelcal_cli.studies import reproduce
+    from accelcal_cli.views.studies import experiment_catalogue
 
     if name is None:
-        from accelcal_cli.views.experiments import catalogue_table
-
-        _list(catalogue_table(), format, [study_options.raw, plot, study_options.cluster, runs, seed])
+        if any(value is not None for value in (study_options.raw, plot, study_options.cluster, runs, seed)):
+            raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
+        options.print_result(format, experiment_catalogue, lambda: [experiment_catalogue()])
         return
-    running.check_plot(plot)
+    options.check_files([], {"--raw": study_options.raw, "--plot": plot})
+    options.check_plot(plot)
     if name in reproduce.navigation_names():
         _voyage(name, runs, seed, study_options, plot, format)
     else:
@@ -63,23 +66,14 @@ def _experiment(
     experiment: Experiment, study_options: running.StudyOptions, plot: str | None, format: str
 ) -> None:
     """Run an experiment on optimizers and print it beside the paper's numbers."""
-    from accelcal_cli.output.console import show
     from accelcal_cli.studies.reproduce import curves
-    from accelcal_cli.views.experiments import experiment_tables
-    from accelcal_cli.views.studies import study_blocks
+    from accelcal_cli.views.studies import experiment_tables, study_blocks
 
     records = study_options.run(experiment)
     results = experiment_tables(experiment, records)
-    if format == "table":
-        plotted = curves(experiment, records, shown=True)
-        show(study_blocks(experiment.title, results, plotted, experiment.note))
-    else:
-        _print(experiment.name, experiment.title, results, format)
-    sys.stdout.flush()
-    if plot is not None:
-        from accelcal_cli.output.plot import plot_convergence
-
-        plot_convergence(experiment.title, curves(experiment, records), experiment.tolerance, plot)
+    shown = study_blocks(experiment.title, results, curves(experiment, records, shown=True), experiment.note)
+    _print(experiment.name, experiment.title, results, shown, format)
+    running.draw_convergence(plot, experiment.title, curves(experiment, records), experiment.tolerance)
 
 
 def _voyage(
@@ -92,42 +86,31 @@ def _voyage(
 ) -> None:
     """Run an experiment on navigation filters and print it beside the paper's numbers."""
     from accelcal_cli.navigation.study import Navigation, load_study
-    from accelcal_cli.output.console import show
     from accelcal_cli.views.navigation import chart_of, curves, summary, with_paper
 
     settings = load_study(name, {"runs": runs, "seed": seed})
     study = Navigation(settings, settings.filters, (settings.ins,))
     records = study_options.run(study)
     table = with_paper(summary(study, records), settings)
-    if format == "table":
-        show([table])
-    else:
-        _print(name, settings.title, [table], format)
-    sys.stdout.flush()
+    _print(name, settings.title, [table], [table], format)
     if plot is not None:
         from accelcal_cli.output.plot import plot_voyage
 
         plot_voyage(chart_of(study, records, curves(study, records)), plot)
 
 
-def _print(name: str, title: str, tables: Sequence[Table], format: str) -> None:
-    """Print the tables of an experiment for other programs."""
+def _print(name: str, title: str, tables: Sequence[Table], blocks: Iterable[Block], format: str) -> None:
+    """Print the tables of an experiment for other programs, or what it shows to people."""
+    from accelcal_cli.output.console import show
     from accelcal_cli.output.machine import json_rows, json_text, write_csv
 
-    if format == "json":
+    if format == "table":
+        show(blocks)
+    elif format == "json":
         parts = [{"title": table.title, "rows": json_rows([table])} for table in tables]
         sys.stdout.write(json_text({"name": name, "title": title, "tables": parts}))
-        return
-    for number, table in enumerate(tables):
-        sys.stdout.write("\n" if number else "")
-        write_csv(table, sys.stdout)
-
-
-def _list(table: Table, format: str, stated: Sequence[object]) -> None:
-    if any(value is not None for value in stated):
-        raise UsageError('expected the name of an experiment; "accelcal reproduce" alone lists them')
-    if not options.print_rows(format, table):
-        from accelcal_cli.output.console import show
-
-        show([table])
+    else:
+        for number, table in enumerate(tables):
+            sys.stdout.write("\n" if number else "")
+            write_csv(table, sys.stdout)
     sys.stdout.flush()

@@ -18,11 +18,10 @@ from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.engine import Executors, Journal, Progress
-    from accelcal_cli.studies.study import Record, Study
+    from accelcal_cli.studies.study import Curves, Record, Study
 
 MOST_JOBS = 1024
 RAW_SUFFIXES = (".csv", ".parquet")
-PLOT_SUFFIXES = (".png", ".svg")
 
 in_runs = options.panel("Runs")
 
@@ -62,7 +61,12 @@ class StudyOptions:
             UsageError: options that do not go together, or a raw file with another suffix.
             AccelcalError: what the study, the journal or the cluster could not do.
         """
-        self._check()
+        if self.raw is not None:
+            options.check_suffix("--raw", self.raw, RAW_SUFFIXES)
+        elif self.resume:
+            raise UsageError("--resume needs the --raw FILE of the interrupted study")
+        if self.cluster is not None and self.jobs != 1:
+            raise UsageError("--jobs and --cluster: expected one of them, not both")
         from accelcal_cli.output.machine import write_table
         from accelcal_cli.studies.engine import Journal, run_study
         from accelcal_cli.views.studies import raw_table
@@ -81,14 +85,6 @@ class StudyOptions:
         journal.remove()
         return records
 
-    def _check(self) -> None:
-        if self.raw is not None:
-            _check_target("--raw", self.raw, RAW_SUFFIXES)
-        elif self.resume:
-            raise UsageError("--resume needs the --raw FILE of the interrupted study")
-        if self.cluster is not None and self.jobs != 1:
-            raise UsageError("--jobs and --cluster: expected one of them, not both")
-
     def _executors(self, study: Study) -> Executors | None:
         from accelcal_cli.studies import pools
 
@@ -98,27 +94,12 @@ class StudyOptions:
         return partial(pools.local_pool, useful) if useful > 1 else None
 
 
-def check_plot(plot: str | None) -> None:
-    """Refuse a plot that could not be written, before any run is made for it.
+def draw_convergence(plot: str | None, title: str, curves: Curves, tolerance: float) -> None:
+    """Write the picture of the median convergence where one was asked for; see `output.plot.plot_convergence`."""
+    if plot is not None:
+        from accelcal_cli.output.plot import plot_convergence
 
-    Raises:
-        UsageError: another suffix, or matplotlib is missing.
-        OutputError: the file cannot be written.
-    """
-    if plot is None:
-        return
-    from importlib.util import find_spec
-
-    _check_target("--plot", plot, PLOT_SUFFIXES)
-    if find_spec("matplotlib") is None:
-        raise UsageError("--plot needs matplotlib: pip install 'accelcal[plot]'")
-
-
-def _check_target(option: str, path: str, suffixes: tuple[str, ...]) -> None:
-    from accelcal_cli.output.files import check_target
-
-    options.check_suffix(option, path, suffixes)
-    check_target(path)
+        plot_convergence(title, curves, tolerance, plot)
 
 
 def _kept(journal: Journal) -> str:

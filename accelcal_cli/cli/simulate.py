@@ -78,7 +78,7 @@ def command(
     acceleration and, with --gyro, turning rate, in which `detect` finds the poses.
     """
     from accelcal_cli.config import dump
-    from accelcal_cli.output.files import check_target, whole_file
+    from accelcal_cli.output.files import whole_file
     from accelcal_cli.output.machine import write_log
     from accelcal_cli.rng import Purpose, Streams
     from accelcal_cli.schema import from_mapping
@@ -96,12 +96,12 @@ def command(
     if output == truth:
         raise UsageError(f'--truth "{truth}": expected another file than --output')
     stated = options.stated(rate=rate, hold=hold, move=move, tremor=tremor)
-    _check_raw(raw, [*stated, *(["gyro"] * gyro)], samples, attitude)
+    if not raw and (stated or gyro):
+        raise UsageError(f"--{next(iter(stated), 'gyro')} needs --raw")
+    if raw and (samples > 1 or attitude):
+        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'} cannot be used with --raw")
     shipped = not Path(sensor).suffix
-    options.check_apart([None if shipped else sensor], {"-o": output, "--truth": truth})
-    for path in (output, truth):
-        if path is not None:
-            check_target(path)
+    options.check_files([None if shipped else sensor], {"-o": output, "--truth": truth})
     local_g = gravity.stated() or STANDARD_GRAVITY
     device = load_sensor(sensor)
     u = directions(positions, scheme, Streams(seed, [0], Purpose.ATTITUDE).normal(positions, 3)[0])
@@ -124,13 +124,6 @@ def command(
         with whole_file(truth) as file:
             file.write(dump(record))
     options.tell_written([output, truth], quiet)
-
-
-def _check_raw(raw: bool, stated: list[str], samples: int, attitude: bool) -> None:
-    if not raw and stated:
-        raise UsageError(f"--{stated[0]} needs --raw")
-    if raw and (samples > 1 or attitude):
-        raise UsageError(f"{'--samples' if samples > 1 else '--attitude'} cannot be used with --raw")
 
 
 def _header(file: IO[str], first: list[str], labelled: bool, attitude: bool) -> None:

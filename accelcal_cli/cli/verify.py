@@ -12,10 +12,7 @@ from accelcal_cli.cli import options, process
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.verification.verify import Verification
-
-FAILED = 1
+    pass
 
 in_test = options.panel("Test")
 
@@ -52,16 +49,22 @@ def command(
     """
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.verification.verify import verify
+    from accelcal_cli.views.verification import blocks, differences
 
     options.check_input(data)
     if not 0 < level < 1:
         raise UsageError(f"--level {level:g}: expected a chance between 0 and 1")
     old = options.load_result(result, data)
-    _check_gravity(g, old, result)
+    if g is not None and not math.isclose(options.GravityOptions(g).stated() or 0.0, old.g, rel_tol=1e-9):
+        raise UsageError(
+            f"--g {g:g}: {result} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
+        )
     readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():
-        _show(verification, format)
+        options.print_result(
+            format, lambda: differences(verification), lambda: blocks(verification), verification.record
+        )
     with process.even_if_unread(sys.stderr):
         options.caution(result, old.cautions, quiet)
         if format != "table":  # the table shows them itself
@@ -69,21 +72,4 @@ def command(
         if not verification.within:
             options.tell([f"rms {verification.rms:.6g} is above the tolerance {tolerance:.6g}"], quiet)
     if not verification.passed:
-        raise typer.Exit(FAILED)
-
-
-def _check_gravity(g: float | None, old: Calibration, name: str) -> None:
-    if g is not None and not math.isclose(options.GravityOptions(g).stated() or 0.0, old.g, rel_tol=1e-9):
-        raise UsageError(
-            f"--g {g:g}: {name} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
-        )
-
-
-def _show(verification: Verification, format: str) -> None:
-    from accelcal_cli.views.verification import differences
-
-    if not options.print_data(format, verification.record, lambda: differences(verification)):
-        from accelcal_cli.output.console import show
-        from accelcal_cli.views.verification import blocks
-
-        show(blocks(verification))
+        raise typer.Exit(options.BAD_VERDICT)

@@ -42,9 +42,11 @@ class ArduPilot(DiagonalExporter):
             *(f"Warning: {warning}." for warning in self.warnings(result)),
         ]
         number = "" if self.instance == 0 else str(self.instance + 1)
-        values = [(f"OFFS_{axis.upper()}", offset[i]) for i, axis in enumerate(AXES)]
-        values += [(f"SCAL_{axis.upper()}", scale[i]) for i, axis in enumerate(AXES)]
-        lines = "".join(f"INS_ACC{number}{key},{value:.9g}\n" for key, value in values)
+        lines = "".join(
+            f"INS_ACC{number}{key}_{axis.upper()},{value:.9g}\n"
+            for key, values in (("OFFS", offset), ("SCAL", scale))
+            for axis, value in zip(AXES, values, strict=True)
+        )
         return (base.comment(header) + lines).encode()
 
     def warnings(self, result: Calibration) -> tuple[str, ...]:

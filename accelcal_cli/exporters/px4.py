@@ -41,7 +41,9 @@ class Px4(DiagonalExporter):
             *(f"Warning: {warning}." for warning in self.warnings(result)),
             "Vehicle-Id Component-Id Name Value Type",
         ]
-        values = [(f"{axis.upper()}OFF", model.D[i]) for i, axis in enumerate(AXES)]
-        values += [(f"{axis.upper()}SCALE", 1.0 / np.diagonal(model.K)[i]) for i, axis in enumerate(AXES)]
-        lines = "".join(f"1\t1\t{name}_{key}\t{value:.9g}\t{REAL32}\n" for key, value in values)
+        lines = "".join(
+            f"1\t1\t{name}_{axis.upper()}{key}\t{value:.9g}\t{REAL32}\n"
+            for key, values in (("OFF", model.D), ("SCALE", 1.0 / np.diagonal(model.K)))
+            for axis, value in zip(AXES, values, strict=True)
+        )
         return (base.comment(header) + lines).encode()

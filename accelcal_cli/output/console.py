@@ -1,19 +1,24 @@
-"""Results for people: blocks drawn with rich, on a terminal of any width or into a pipe."""
+"""Results for people: blocks drawn with rich, on a terminal of any width or into a pipe.
+
+Convergence curves have a logarithmic axis: one is drawn with Braille dots, several with letters.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import IO
+from itertools import pairwise
+from string import ascii_letters
+from typing import IO, Any
 
 from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 
-from accelcal_cli.output.curve import draw, draw_several
 from accelcal_cli.table import Table
 from accelcal_cli.views.blocks import Block, Conclusion, Convergence, Paragraph
 
@@ -53,14 +58,7 @@ def show(blocks: Iterable[Block], out: Console | None = None) -> None:
     """Draw blocks one under the other, on standard output when there is no other console."""
     out = out or console()
     for block in blocks:
-        if isinstance(block, Table):
-            _show_table(block, out)
-        elif isinstance(block, Conclusion):
-            _show_conclusion(block, out)
-        elif isinstance(block, Convergence):
-            _show_convergence(block, out)
-        else:
-            _show_paragraph(block, out)
+        DRAW[type(block)](block, out)
 
 
 def _show_paragraph(block: Paragraph, out: Console) -> None:
@@ -87,10 +85,10 @@ def _show_convergence(block: Convergence, out: Console) -> None:
     single, width = block.curves.get(""), min(60, out.width - 22)
     if single is not None and out.width >= NARROWEST_CURVE and out.encoding.startswith("utf"):
         out.print(Text(block.title))
-        out.print(draw(single, width=width), crop=False, overflow="ignore")
+        out.print(draw_curve(single, width=width), crop=False, overflow="ignore")
     if single is None and out.width >= NARROWEST_CURVES:
         out.print(Text(block.title))
-        text = draw_several(block.curves, width=width, least=block.least)
+        text = draw_curves(block.curves, width=width, least=block.least)
         out.print(Text(text), crop=False, overflow="ignore", soft_wrap=True)
         out.print()
 
@@ -180,3 +178,117 @@ def _drawn(table: Table, out: Console) -> Text:
     title = [table.title, ""] if table.title else []
     head, body = "\n".join([*title, *lines[:heads]]), "\n".join([rule, *lines[heads:], ""])
     return Text.assemble((head, "bold"), "\n", body, no_wrap=True, overflow="ignore")
+
+
+DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
+"""Bits of the dots of a Braille cell: left column from above, right column from above."""
+
+Points = Sequence[tuple[float, float]]
+"""Pairs (evaluations, cost)."""
+
+
+def draw_curve(points: Points, width: int = 60, height: int = 8) -> str:
+    """Return a plot of (evaluations, cost) with log10 of the cost upwards.
+
+    Args:
+        points: at least one; costs of zero are drawn on the floor.
+        width, height: of the plot in characters, labels come on top of that.
+    """
+    limits = _limits([points])
+    if limits is None:
+        return "cost 0 from the first evaluation on"
+    high, span = limits
+    low = high - span
+    first, last = points[0][0], points[-1][0]
+    cells = [[0] * width for _ in range(height)]
+    previous = None
+    for evaluations, cost in points:
+        column = round((evaluations - first) / max(last - first, 1) * (2 * width - 1))
+        row = _row(cost, limits, 4 * height)
+        for r in range(min(row, previous if previous is not None else row), row + 1):
+            cells[r // 4][column // 2] |= DOTS[column % 2][r % 4]
+        previous = row
+    lines = ["".join(chr(0x2800 + bits) if bits else " " for bits in row) for row in cells]
+    return _framed(lines, (f"{10**high:.0e}", f"{10**low:.0e}"), (first, last))
+
+
+def draw_curves(curves: Mapping[str, Points], width: int = 60, height: int = 10, least: float = 0.0) -> str:
+    """Return one plot of several curves, each of a letter, with a legend of letters and labels under it.
+
+    Args:
+        curves: points by label, at least one each.
+        width, height: of the plot in characters.
+        least: costs below this are drawn on the floor, as those of zero are.
+    """
+    limits = _limits(curves.values(), least)
+    if limits is None:
+        return "cost 0 from the first evaluation on"
+    high, span = limits
+    first = min(points[0][0] for points in curves.values())
+    last = max(points[-1][0] for points in curves.values())
+    cells: list[list[list[str]]] = [[[] for _ in range(width)] for _ in range(height)]
+    for letter, points in zip(ascii_letters, curves.values(), strict=False):
+        columns = [round((n - first) / max(last - first, 1) * (width - 1)) for n, _ in points]
+        rows = [_row(cost, limits, height) for _, cost in points]
+        for column, row in set(_steps(columns, rows)):
+            cells[row][column].append(letter)
+    # Curves that share a cell take turns along the line.
+    lines = ["".join(c[i % len(c)] if c else " " for i, c in enumerate(row)) for row in cells]
+    below = any(cost < 10 ** (high - span) * 0.999 for points in curves.values() for _, cost in points)
+    floor = f"{'<' * below}{10 ** (high - span):.0e}"
+    plot = _framed(lines, (f"{10**high:.0e}", floor), (first, last))
+    legend = [f"{letter} {label}" for letter, label in zip(ascii_letters, curves, strict=False)]
+    return "\n".join([plot, *_wrapped(legend, width)])
+
+
+def _steps(columns: Sequence[int], rows: Sequence[int]) -> Iterable[tuple[int, int]]:
+    """Yield every cell of a staircase through the points, without gaps in either direction."""
+    yield columns[0], rows[0]
+    for (left, above), (right, below) in pairwise(zip(columns, rows, strict=True)):
+        for column in range(left + 1, right + 1):
+            yield column, above
+        for row in range(above + 1, below + 1):
+            yield right, row
+
+
+def _limits(curves: Iterable[Points], least: float = 0.0) -> tuple[float, float] | None:
+    """Return log10 of the highest positive cost and the span down to the lowest; None when there is none."""
+    costs = [cost for points in curves for _, cost in points if 0 < cost < math.inf]
+    levels = [math.log10(max(cost, least)) for cost in costs]
+    return (max(levels), max(max(levels) - min(levels), 1e-9)) if levels else None
+
+
+def _row(cost: float, limits: tuple[float, float], height: int) -> int:
+    high, span = limits
+    if cost <= 0:
+        return height - 1
+    part = (high - min(math.log10(cost), high)) / span
+    return round(min(part, 1.0) * (height - 1))
+
+
+def _framed(lines: Sequence[str], levels: tuple[str, str], ends: tuple[float, float]) -> str:
+    """Return lines of a plot with the costs of its first and last line and the evaluations of its ends."""
+    width = len(lines[0])
+    labels = [levels[0], *[""] * (len(lines) - 2), levels[1]]
+    body = [f"{text:>7} |{line}".rstrip() for text, line in zip(labels, lines, strict=True)]
+    foot = f"{ends[0]:,.0f}".ljust(width - 12) + f"{ends[1]:,.0f}".rjust(12)
+    return "\n".join([*body, " " * 8 + "+" + "-" * width, " " * 9 + foot + "  evaluations"])
+
+
+def _wrapped(words: Iterable[str], width: int) -> list[str]:
+    """Return words on as few lines as fit into the width of a plot."""
+    lines = [""]
+    for word in words:
+        if lines[-1] and len(lines[-1]) + len(word) + 3 > width:
+            lines.append("")
+        lines[-1] += ("   " if lines[-1] else "") + word
+    return [" " * 9 + line for line in lines]
+
+
+DRAW: dict[type[Block], Callable[[Any, Console], None]] = {
+    Table: _show_table,
+    Conclusion: _show_conclusion,
+    Convergence: _show_convergence,
+    Paragraph: _show_paragraph,
+}
+"""What draws a block of each kind."""

@@ -71,9 +71,8 @@ class Watch:
         """Return the line of the latest pose."""
         index, pose = self.capture.recognised()[-1], self.capture.poses[-1]
         name = "not in the plan, kept" if index is None else describe(self.capture.planned[index])
-        spread = max(pose.spread)
         left = len(self.capture.missing())
-        return f"pose {len(self.capture.poses)}: {name}; {pose.n} readings, sd {spread:.3g}; {left} to take"
+        return f"pose {len(self.capture.poses)}: {name}; {pose.n} readings, sd {max(pose.spread):.3g}; {left} to take"
 
     def _drawn(self) -> Group:
         """Return what is held now, which a low terminal must not cut off, and what has become of the poses."""
@@ -130,18 +129,8 @@ class PoseFile:
             try:
                 self._send([HEADER])
             except BaseException:
-                self._close()
+                self.close()
                 raise
-
-    def __enter__(self) -> PoseFile:
-        """Keep poses."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close what was opened."""
-        self._close()
 
     def save(self, taken: Sequence[CapturedPose], *, last: bool = False) -> None:
         """Keep all poses taken so far; `last` says that no more will come.
@@ -176,7 +165,8 @@ class PoseFile:
         except OSError as error:
             raise unwritten(self.path, error) from None
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close what was opened."""
         if self._stream is not None and self.path != "-":
             self._stream.close()
 

@@ -17,8 +17,8 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.detection.detect import Detection
 from accelcal_cli.navigation.study import BOUND, INS
 from accelcal_cli.output.files import whole_file
+from accelcal_cli.studies.study import Curves
 from accelcal_cli.table import Table
-from accelcal_cli.views.blocks import Curves
 from accelcal_cli.views.navigation import Chart
 
 if TYPE_CHECKING:
@@ -39,9 +39,12 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
         tolerance: drawn as a thin line.
         path: ends in .png or .svg.
     """
+    from matplotlib.lines import Line2D
+
     across = min(ACROSS, math.ceil(math.sqrt(len(curves))))
     down = -(-len(curves) // across)
     labels = list(dict.fromkeys(label for panel in curves.values() for label in panel))
+    handles = [Line2D([], [], label=label, **line_style(i)) for i, label in enumerate(labels)]
     with picture(path, max(4.2 * across, 6.0), 3.2 * down + 1.1) as figure:
         figure.suptitle(title, fontsize=11)
         panels = figure.subplots(down, across, squeeze=False).ravel()
@@ -49,15 +52,7 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
             _panel(axes, name, panel, labels, tolerance)
         for axes in panels[len(curves) :]:
             axes.set_axis_off()
-        figure.legend(
-            handles=_legend(labels), loc="outside lower center", ncols=min(len(labels), 5), frameon=False
-        )
-
-
-def _legend(labels: list[str]) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    return [Line2D([], [], label=label, **line_style(i)) for i, label in enumerate(labels)]
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(labels), 5), frameon=False)
 
 
 def _panel(
@@ -139,7 +134,8 @@ def plot_log(detection: Detection, path: str) -> None:
     """
     with picture(path, 12.0, 4.8) as figure:
         axes = figure.subplots()
-        edges = _spans(detection)
+        poses = detection.intervals  # first and last abscissa of each, shape (I, 2)
+        edges: Float = np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
         _log(axes, detection)
         _shade(axes, edges)
         axes.set_title(
@@ -147,14 +143,8 @@ def plot_log(detection: Detection, path: str) -> None:
             fontsize=11,
             pad=14,
         )
-        axes.set(xlabel="row" if detection.intervals.time is None else "time", ylabel="output, sensor units")
+        axes.set(xlabel="row" if poses.time is None else "time", ylabel="output, sensor units")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-
-
-def _spans(detection: Detection) -> Float:
-    """Return first and last abscissa of each interval, shape (I, 2)."""
-    poses = detection.intervals
-    return np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
 
 
 def _shade(axes: Axes, edges: Float) -> None:

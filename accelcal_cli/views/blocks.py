@@ -11,9 +11,6 @@ from dataclasses import dataclass
 from accelcal_cli.arrays import Float
 from accelcal_cli.table import Table
 
-Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
-"""Evaluations and median cost, by function (or problem) and optimizer."""
-
 
 @dataclass(frozen=True)
 class Paragraph:

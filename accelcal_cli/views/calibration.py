@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,10 +38,8 @@ def parameter_tables(result: Calibration) -> list[Table]:
 
 def blocks(result: Calibration) -> list[Block]:
     """Return what a calibration shows: verdict first, then tables, notes and convergence."""
-    curve: list[Block] = []
-    if len(result.convergence) > 1:
-        title = f"Convergence of {result.optimizer} (best cost L so far, logarithmic)"
-        curve = [Convergence(title, {"": result.convergence})]
+    title = f"Convergence of {result.optimizer} (best cost L so far, logarithmic)"
+    curve = [Convergence(title, {"": result.convergence})] if len(result.convergence) > 1 else []
     conclusion = Conclusion(result.verdict, result.reasons, result.cautions)
     return [conclusion, BLANK, *tables(result), *notes(result.notes), *curve]
 
@@ -47,19 +47,18 @@ def blocks(result: Calibration) -> list[Block]:
 def parameters(result: Calibration) -> Table:
     """Return K_a and D_a with their one-sigma."""
     lost = _undetermined(result)
-    rows = []
-    for i in range(3):
-        row: list[object] = [AXES[i]]
-        for j in range(3):
-            row += _pair(result.K_a[i, j], result.sigma.K_a[i, j], lost=bool(lost[i, j]))
-        row += _pair(result.D_a[i], result.sigma.D_a[i], lost=bool(lost[3, i]))
-        rows.append(row)
-    columns = [Column("axis")]
-    for name in ("K_x", "K_y", "K_z", "bias"):
-        columns += [
-            Column(name, format=".8g"),
-            Column("sigma", format=".2g", key=f"sigma_{name}", beside=True),
-        ]
+    entries = [  # value, sigma and whether it is lost, of a row of K_a and then the bias
+        np.column_stack(pair)
+        for pair in ((result.K_a, result.D_a), (result.sigma.K_a, result.sigma.D_a), (lost[:3], lost[3]))
+    ]
+    rows = tuple(
+        (axis, *chain.from_iterable(_pair(v, s, lost=bool(gone)) for v, s, gone in zip(*row, strict=True)))
+        for axis, *row in zip(AXES, *entries, strict=True)
+    )
+    columns = [
+        (Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}", beside=True))
+        for name in ("K_x", "K_y", "K_z", "bias")
+    ]
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
@@ -67,7 +66,7 @@ def parameters(result: Calibration) -> Table:
             "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
             "gauge lower and the bias."
         )
-    return Table("Calibration", tuple(columns), tuple(tuple(r) for r in rows), tuple(notes))
+    return Table("Calibration", (Column("axis"), *chain.from_iterable(columns)), rows, tuple(notes))
 
 
 def _undetermined(result: Calibration) -> NDArray[np.bool_]:
@@ -172,27 +171,26 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
 def fit(result: Calibration) -> Table:
     """Return how well the readings fit."""
     unit = result.unit
-    rows: list[tuple[object, ...]] = [
+    polished = [("cost L after polish", f"{result.cost:.9g}", f"({unit})^4")]
+    chance = result.noise_ratio is not None and [
+        ("residual noise / noise expected from the readings", f"{result.noise_ratio:.3g}", ""),
+        ("p-value", f"{result.noise_chance:.2g}", ""),
+    ]
+    rows = (
         ("rms of |f| - g before", f"{result.rms_before:.6g}", unit),
         ("rms of |f| - g after", f"{result.rms:.6g}", unit),
         ("noise of one pose, s", f"{result.s:.6g}" if result.freedom > 0 else "-", unit),
+        *(chance or ()),
         ("poses", str(result.poses), ""),
         ("degrees of freedom", str(result.freedom), ""),
         (f"cost L after {result.optimizer}", f"{result.cost_search:.9g}", f"({unit})^4"),
-        ("cost L after polish", f"{result.cost:.9g}", f"({unit})^4"),
+        *(polished if result.settings.get("polish", True) else ()),
         ("evaluations", f"{result.evaluations:,}", ""),
         ("searches in this minimum", f"{result.runs_agreeing} of {result.runs}", ""),
         ("local gravity g", f"{result.g:.7g}", unit),
-    ]
-    if not result.settings.get("polish", True):
-        rows.pop(6)
-    if result.noise_ratio is not None:
-        rows.insert(3, ("residual noise / noise expected from the readings", f"{result.noise_ratio:.3g}", ""))
-        rows.insert(4, ("p-value", f"{result.noise_chance:.2g}", ""))
-    notes = (f"Before: {result.before}.",)
-    return Table(
-        "Fit", (Column("quantity"), Column("value"), Column("unit", beside=True)), tuple(rows), notes
     )
+    columns = (Column("quantity"), Column("value"), Column("unit", beside=True))
+    return Table("Fit", columns, rows, (f"Before: {result.before}.",))
 
 
 def observability(result: Calibration) -> Table:

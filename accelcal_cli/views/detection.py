@@ -34,11 +34,12 @@ def blocks(detection: Detection) -> list[Block]:
 def poses_table(detection: Detection) -> Table:
     """Return one row per pose: rows, count, mean, standard deviation, times. `accelcal calibrate` reads it as CSV."""
     poses = detection.intervals
-    columns = [Column("start", key="start", format=","), Column("end", format=","), Column("n", format=",")]
-    columns += [Column(f"N{axis}", format=".8g") for axis in "xyz"]
-    columns += [Column(f"s{axis}", format=".3g") for axis in "xyz"]
-    parts = [poses.start[:, None], poses.end[:, None], poses.n[:, None]]
-    rows = [list(map(int, row)) for row in np.hstack(parts)]
+    columns = [
+        *(Column(name, format=",") for name in ("start", "end", "n")),
+        *(Column(f"N{axis}", format=".8g") for axis in "xyz"),
+        *(Column(f"s{axis}", format=".3g") for axis in "xyz"),
+    ]
+    rows = np.column_stack([poses.start, poses.end, poses.n]).astype(int).tolist()
     values = [poses.mean, poses.scatter]
     if poses.time is not None:
         columns += [Column("t_start", format=".10g"), Column("t_end", format=".10g")]

@@ -75,23 +75,18 @@ def counts(fleet: Fleet) -> str:
 
 def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Block]:
     """Return what a fleet shows: how many sensors of each verdict, then what is worth knowing."""
-    return [Paragraph(heading=counts(fleet)), BLANK, *summary(fleet, labels, standouts, g)]
-
-
-def summary(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Table]:
-    """Return what a person wants to know of a fleet, in reading order."""
-    tables = []
+    shown: list[Block] = [Paragraph(heading=counts(fleet)), BLANK]
     if fleet.determined.any():
-        tables += [_spread(fleet, g), _worst(fleet, labels, g)]
+        shown += [_spread(fleet, g), _worst(fleet, labels, g)]
     warned = np.flatnonzero(fleet.caution != "")
     if len(warned):
-        tables.append(_warned(fleet, labels, warned, g))
+        shown.append(_warned(fleet, labels, warned, g))
     if standouts:
-        tables.append(_standing_out(labels, standouts))
+        shown.append(_standing_out(labels, standouts))
     bad = np.flatnonzero(fleet.verdict != "good")
     if len(bad):
-        tables.append(_not_good(fleet, labels, bad))
-    return tables
+        shown.append(_not_good(fleet, labels, bad))
+    return shown
 
 
 def _spread(fleet: Fleet, g: float) -> Table:
@@ -143,13 +138,14 @@ def _worst(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
         )
         for r in order
     ]
-    return Table("Worst fit", columns, tuple(rows), _more(int((fleet.outlying != "").sum())))
+    outlying = int((fleet.outlying != "").sum())
+    note = f"Sensors with outliers: {outlying:,} (column outlying_poses of --format csv)."
+    return Table("Worst fit", columns, tuple(rows), (note,) if outlying else ())
 
 
-def _more(outlying: int) -> tuple[str, ...]:
-    if not outlying:
-        return ()
-    return (f"Sensors with outliers: {outlying:,} (column outlying_poses of --format csv).",)
+def _more(number: int, where: str = "") -> tuple[str, ...]:
+    """Return a note of the sensors that are not shown, of a number of them."""
+    return (f"And {number - SHOWN:,} more{where}.",) if number > SHOWN else ()
 
 
 def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table:
@@ -173,12 +169,11 @@ def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table
         Column("unit"),
         Column("z", format="+.1f"),
     )
-    notes = [
+    note = (
         "z: distance from the median in standard deviations of the fleet, by its median absolute deviation."
-    ]
-    if len(standouts) > SHOWN:
-        notes.append(f"And {len(standouts) - SHOWN:,} more (column stands_out of --format csv).")
-    return Table("Stand out from the fleet", columns, rows, tuple(notes))
+    )
+    more = _more(len(standouts), " (column stands_out of --format csv)")
+    return Table("Stand out from the fleet", columns, rows, (note, *more))
 
 
 def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table:
@@ -188,21 +183,19 @@ def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table
         (labels[r], 100.0 * float(fleet.s[r]) / g, fleet.outlying[r], CLAUSE.split(fleet.caution[r])[0])
         for r in order
     )
-    notes = ["s: standard deviation of one pose. Full sentences: column caution of --format csv."]
-    if len(warned) > SHOWN:
-        notes.append(f"And {len(warned) - SHOWN:,} more.")
+    note = "s: standard deviation of one pose. Full sentences: column caution of --format csv."
     columns = (
         Column("sensor"),
         Column("s", "% of g", ".3g"),
         Column("outlying poses"),
         Column("caution"),
     )
-    return Table("Cautions", columns, rows, tuple(notes))
+    return Table("Cautions", columns, rows, (note, *_more(len(warned))))
 
 
 def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
     """Return the sensors whose verdict is not good, the worst verdict first."""
     order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
     rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r].partition(ADVICE)[0]) for r in order[:SHOWN])
-    notes = (f"And {len(bad) - SHOWN:,} more.",) if len(bad) > SHOWN else ()
-    return Table("Not good", (Column("sensor"), Column("verdict"), Column("why")), rows, notes)
+    columns = (Column("sensor"), Column("verdict"), Column("why"))
+    return Table("Not good", columns, rows, _more(len(bad)))

@@ -24,16 +24,19 @@ SO_FAR = ("verdict", "reasons", "cautions")
 def pose_table(plan: Plan) -> Table:
     """Return one row per pose: how to hold the sensor, and the worst of each kind expected after it."""
     rows = [_pose_row(plan, k) for k in range(len(plan.stages))]
-    columns = [Column("pose", format="d"), Column("hold")]
-    columns += [Column(axis, format=".3f") for axis in "xyz"]
-    columns += [Column(f"DOP {SHORT[kind]}", format=".3f", key=f"dop_{kind}") for kind, *_ in KINDS]
-    columns += [Column(f"sigma {SHORT[kind]}", unit, ".3g", f"sigma_{kind}") for kind, _, unit, _ in KINDS]
+    columns = (
+        Column("pose", format="d"),
+        Column("hold"),
+        *(Column(axis, format=".3f") for axis in "xyz"),
+        *(Column(f"DOP {SHORT[kind]}", format=".3f", key=f"dop_{kind}") for kind, *_ in KINDS),
+        *(Column(f"sigma {SHORT[kind]}", unit, ".3g", f"sigma_{kind}") for kind, _, unit, _ in KINDS),
+    )
     notes = (
         "x, y, z: direction of the specific force (up) in the sensor's axes. DOP and sigma: the largest of each kind "
         "after the pose; a dash where the poses do not determine it.",
         *_notes(plan),
     )
-    return Table("Poses to take next", tuple(columns), tuple(rows), notes).filled()
+    return Table("Poses to take next", columns, tuple(rows), notes).filled()
 
 
 def _pose_row(plan: Plan, k: int) -> tuple[object, ...]:

@@ -49,19 +49,20 @@ def _row(d: Difference, result: Verification) -> tuple[object, ...]:
 def evidence(result: Verification) -> Table:
     """Return what the verdict rests on."""
     unit = result.unit
-    rows: list[tuple[object, ...]] = [
+    known = result.freedom > 0
+    noise = [("p-value of the difference in noise", f"{result.noise_chance:.2g}", "")] if known else []
+    tolerance = [] if result.tolerance is None else [("tolerance", f"{result.tolerance:g}", unit)]
+    rows = (
         ("p-value, all tests together", f"{result.chance:.3g}", ""),
         ("level", f"{result.level:g}", ""),
         (f"chi-square of {result.directions} directions", f"{result.chi_square:.4g}", ""),
         ("p-value of that chi-square", f"{result.chance_together:.3g}", ""),
         ("noise of one pose, old", f"{result.s_old:.6g}", unit),
-        ("noise of one pose, new", f"{result.s_new:.6g}" if result.freedom > 0 else "-", unit),
+        ("noise of one pose, new", f"{result.s_new:.6g}" if known else "-", unit),
+        *noise,
         ("rms of |f| - g under the old result", f"{result.rms:.6g}", unit),
+        *tolerance,
         ("poses", str(result.poses), ""),
         ("local gravity g", f"{result.g:.7g}", unit),
-    ]
-    if result.freedom > 0:
-        rows.insert(6, ("p-value of the difference in noise", f"{result.noise_chance:.2g}", ""))
-    if result.tolerance is not None:
-        rows.insert(-2, ("tolerance", f"{result.tolerance:g}", unit))
-    return Table("Tests", (Column("quantity"), Column("value"), Column("unit")), tuple(rows))
+    )
+    return Table("Tests", (Column("quantity"), Column("value"), Column("unit")), rows)

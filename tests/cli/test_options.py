@@ -11,7 +11,7 @@ import typer.main
 
 from accelcal_cli.calibration import settings
 from accelcal_cli.cli import benchmark, calibrate, compare, navigate, options
-from accelcal_cli.cli.main import NAMES, app
+from accelcal_cli.cli.main import NAMES, app, expand, help_text
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.navigation.gravity_map import PRESETS
 from accelcal_cli.navigation.particle_filter import FILTERS
@@ -60,7 +60,7 @@ def test_a_group_stands_for_its_options():
         """Do it."""
         calls.append((name, place, loud))
 
-    spelled = options.expand(command)
+    spelled = expand(command)
     assert list(inspect.signature(spelled).parameters) == ["name", "latitude", "height", "loud"]
     assert spelled.__doc__ == "Do it."
     spelled(name="a", latitude=3.0, height=0.0, loud=True)
@@ -77,7 +77,7 @@ def test_every_option_has_a_panel_and_says_what_it_takes(name):
     for parameter in COMMANDS[name].params:
         if parameter.name != "help":
             assert parameter.rich_help_panel, parameter.name
-            assert "{" not in options.help_text(parameter, None, parameter.help), parameter.name
+            assert "{" not in help_text(parameter, None, parameter.help), parameter.name
             assert parameter.help[0].isupper() or parameter.help[0] == "{", parameter.name
             assert parameter.help.endswith("."), parameter.name
 

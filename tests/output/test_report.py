@@ -17,7 +17,8 @@ from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
-from accelcal_cli.output.report.page import page, pictures, typeset
+from accelcal_cli.output import report as pictures
+from accelcal_cli.output.report import page, typeset
 from accelcal_cli.sensor import poses
 
 G = 9.8

@@ -1,12 +1,13 @@
-"""The pictures of a report: residuals, poses on the sphere, convergence, dilution of precision.
+"""The report: one self-contained page of a calibration, with pictures, for the screen and for paper.
 
-Each is inline SVG without a font, a file or a background of its own. Colours are written as marks and replaced by
-`currentColor` and CSS variables of the page, so that one picture serves a light page, a dark page and paper.
+Each picture is inline SVG without a font, a file or a background of its own. Colours are written as marks and replaced
+by `currentColor` and CSS variables of the page, so that one picture serves a light page, a dark page and paper.
 """
 
 from __future__ import annotations
 
 import html
+import importlib.util
 import io
 import re
 from collections.abc import Iterator
@@ -15,17 +16,99 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from accelcal_cli import __version__
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration, PoseFit
+from accelcal_cli.config import dump
+from accelcal_cli.errors import UsageError
+from accelcal_cli.views import calibration as tables
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+NEEDS = ("jinja2", "matplotlib")
+TEMPLATE = "report.html.jinja"
+RAISED = (("m/s^2", "m/s\u00b2"), (")^4", ")\u2074"), ("(g)\u2074", "g\u2074"))
+
+
+def check_packages() -> None:
+    """Raise UsageError when a package that only reports need is missing."""
+    if any(importlib.util.find_spec(name) is None for name in NEEDS):
+        raise UsageError("a report needs jinja2 and matplotlib: pip install 'accelcal[report]'")
+
+
+def page(result: Calibration, title: str) -> str:
+    """Return the page as HTML; the same result gives the same text.
+
+    Args:
+        result: what is reported.
+        title: heading of the page.
+    """
+    from markupsafe import Markup
+
+    text = (
+        _environment()
+        .get_template(TEMPLATE)
+        .render(
+            result=result,
+            title=title,
+            accuracy=tables.accuracy(result),
+            headline=tables.headline(result),
+            parameters=tables.parameter_tables(result),
+            fit=tables.fit(result),
+            worst=tables.worst_poses(result).filled(),
+            poses=tables.pose_residuals(result),
+            observability=tables.observability(result),
+            pictures={name: Markup(draw(result)) for name, draw in PICTURES.items()},
+            settings=dump(result.record()["settings"]),
+            origin=_origin(result),
+        )
+    )
+    return typeset(text)
+
+
+def typeset(text: str) -> str:
+    """Return text with the powers of units raised."""
+    for plain, raised in RAISED:
+        text = text.replace(plain, raised)
+    return text
+
+
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("accelcal_cli.output", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # Which columns hold numbers, and stand to the right.
+    environment.filters["numeric"] = lambda table: [bool(column.format) for column in table.columns]
+    return environment
+
+
+def _origin(result: Calibration) -> list[tuple[str, str]]:
+    """Return where the numbers come from, name and value."""
+    return [
+        ("readings", str(result.data.get("source", "-"))),
+        ("SHA-256 of the readings", str(result.data.get("sha256", "-"))),
+        ("columns", ", ".join(map(str, result.data.get("columns", [])))),
+        ("poses", f"{result.poses:,}"),
+        ("schema of the result", result.schema),
+        ("calibrated with", f"accelcal {result.version}"),
+        ("reported with", f"accelcal {__version__}"),
+    ]
 
 
 def residuals(result: Calibration) -> str:
     """Return |f| - g of every kept pose before and after calibration, one panel each."""
+    from matplotlib.ticker import MaxNLocator
+
     x = np.array([p.pose + 1 for p in result.poses_fit])
     named = np.isin(x - 1, result.outliers)
     panels = (
@@ -41,7 +124,7 @@ def residuals(result: Calibration) -> str:
             axes.set(title=title, ylabel=f"|f| - g [{result.unit}]")
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.set(xlim=(x.min() - 0.7, x.max() + 0.7), xlabel="pose")
-        _whole_numbers(axes)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     largest = [np.abs(y).max(initial=0.0) for *_, y in panels]
     outliers = f"; outliers (with a cross): {named.sum()}" if named.any() else ""
     return inline(
@@ -113,12 +196,6 @@ def _log_bars(axes: Axes, start: float, end: float) -> None:
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(lambda *_: "")
     axes.set_xlabel("dilution of precision", loc="left")
-
-
-def _whole_numbers(axes: Axes) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 MOST_NUMBERED = 40
