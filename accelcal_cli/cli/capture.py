@@ -144,7 +144,7 @@ def _capture(
     unit: str | None,
 ) -> Capture:
     from accelcal_cli.detection.capture import Capture
-    from accelcal_cli.planning.design import candidates, distinct_poses
+    from accelcal_cli.planning import candidates, distinct_poses
     from accelcal_cli.sensor.model import OUTPUT_OF_1_G
 
     allowed = candidates(fixture)

@@ -13,7 +13,7 @@ from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.verification.verify import Verification
+    from accelcal_cli.verification import Verification
 
 FAILED = 1
 
@@ -51,7 +51,7 @@ def command(
     that --tolerance was missed.
     """
     from accelcal_cli.io.readings import read_readings
-    from accelcal_cli.verification.verify import verify
+    from accelcal_cli.verification import verify
 
     options.check_input(data)
     if not 0 < level < 1:
