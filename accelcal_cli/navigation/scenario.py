@@ -101,7 +101,12 @@ class Scenario:
 
         At the indicated latitude and velocity, which is what a real filter has.
         """
-        return transitions(self.ins, self.turns, self.grade, first, last)
+        motion = Motion(*(values[..., first:last] for values in vars(self.ins.motion).values()))
+        F = discretise(dynamics(motion), self.period)
+        if self.grade.mounting == "strapdown":
+            F = turn_biases(F, np.append(self.turns, 0.0)[first:last])
+        after = np.minimum(np.arange(first + 1, last + 1), self.epochs - 1)
+        return to_metric(F, self.ins.latitude[..., first:last], self.ins.latitude[..., after])
 
     def prior(self) -> Float:
         """Return the variances of the metric states at the start, shape (12,)."""
@@ -115,8 +120,8 @@ class Scenario:
         """Return epochs `first` to `last` - 1 of some runs."""
         ins = self.ins
         fields = (v[rows, first:last] for v in (ins.latitude, ins.longitude, ins.east, ins.north))
-        part = Trajectory(ins.seconds[first:last], *fields)
-        return replace(self, ins=part, measured=self.measured[rows, first:last], error=None)
+        ins = Trajectory(ins.seconds[first:last], *fields)
+        return replace(self, ins=ins, measured=self.measured[rows, first:last], error=None)
 
     def anomaly(self, k: int, north: Float, east: Float) -> Float:
         """Return the map's anomaly in mGal at epoch k for position errors in m, shape (R, ...); NaN off the map."""
@@ -125,16 +130,6 @@ class Scenario:
             v[:, k].reshape(shape) for v in (self.ins.latitude, self.ins.longitude, *self.scale)
         )
         return self.gravity_map.at(latitude - north / meridian, longitude - east / parallel)
-
-
-def transitions(trajectory: Trajectory, turns: Float, grade: InsGrade, first: int, last: int) -> Float:
-    """Return the metric transitions along a trajectory with these turns; see `Scenario.transitions`."""
-    motion = Motion(*(values[..., first:last] for values in vars(trajectory.motion).values()))
-    F = discretise(dynamics(motion), trajectory.step)
-    if grade.mounting == "strapdown":
-        F = turn_biases(F, np.append(turns, 0.0)[first:last])
-    after = np.minimum(np.arange(first + 1, last + 1), len(trajectory.seconds) - 1)
-    return to_metric(F, trajectory.latitude[..., first:last], trajectory.latitude[..., after])
 
 
 def simulate(

@@ -7,7 +7,7 @@ together are merged.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -51,9 +51,7 @@ class Bank:
 
     def at(self, chosen: Int | Bool) -> Bank:
         """Return some of the components."""
-        return Bank(
-            self.run[chosen], self.mean[chosen], self.P[chosen], self.log_weight[chosen], self.misfit[chosen]
-        )
+        return Bank(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
 @FILTERS.register("reference")
@@ -137,8 +135,7 @@ def _weights(bank: Bank, runs: int) -> Float:
     highest = np.full(runs, -np.inf)
     np.maximum.at(highest, bank.run, bank.log_weight)
     weight = np.exp(bank.log_weight - highest[bank.run])
-    normal: Float = weight / np.bincount(bank.run, weight, runs)[bank.run]
-    return normal
+    return np.asarray(weight / np.bincount(bank.run, weight, runs)[bank.run])
 
 
 def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
@@ -155,8 +152,7 @@ def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
 
 def _prune(bank: Bank, runs: int) -> Bank:
     """Return the bank without components of negligible weight."""
-    weight = _weights(bank, runs)
-    keep = ~(weight <= NEGLIGIBLE)  # a diverged run has NaN weights, and stays so
+    keep = ~(_weights(bank, runs) <= NEGLIGIBLE)  # a diverged run has NaN weights, and stays so
     return bank if keep.all() else bank.at(keep)
 
 
@@ -173,7 +169,8 @@ def _merge(bank: Bank) -> Bank:
     """Return the bank in which the heaviest component of each run has absorbed those that coincide with it."""
     keep = np.ones(len(bank.run), dtype=bool)
     log_weight = bank.log_weight.copy()
-    for first, last in _spans(bank.run):
+    edges = [0, *(np.flatnonzero(np.diff(bank.run)) + 1).tolist(), len(bank.run)]
+    for first, last in pairwise(edges):
         own = slice(first, last)
         top = first + int(log_weight[own].argmax())
         away = bank.mean[own, :2] - bank.mean[top, :2]
@@ -183,9 +180,3 @@ def _merge(bank: Bank) -> Bank:
         keep[own] = ~near
         keep[top] = True
     return replace(bank, log_weight=log_weight).at(keep)
-
-
-def _spans(run: Int) -> list[tuple[int, int]]:
-    """Return first and one past the last component of each run."""
-    edges = [0, *(np.flatnonzero(np.diff(run)) + 1).tolist(), len(run)]
-    return list(pairwise(edges))
