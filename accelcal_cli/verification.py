@@ -173,10 +173,14 @@ def verify(
     verdict = _verdict(tests.chance, level, limitations, readings)
     differences = _differences(shift, tests, level if verdict == "changed" else 0.0)
     rms = _rms(old, readings)
+    mismatch = (
+        f"Under the result the new readings miss g by {rms:.3g} {old.unit}: are they in another unit than its "
+        "readings, or from another sensor?"
+    )
     return Verification(
         verdict=verdict,
         reasons=(
-            *_mismatch(rms, old),
+            *((mismatch,) if not rms < MISMATCH * old.g else ()),
             *_reasons(verdict, differences, shift, tests.pair, level),
             *(limitations if verdict == "inconclusive" else ()),
             *notes,
@@ -389,15 +393,6 @@ def _verdict(chance: float, level: float, limitations: tuple[str, ...], readings
         certain = chance < min(level, SURELY) and not readings.cautions
         return "changed" if certain else "inconclusive"
     return "changed" if chance < level else "unchanged"
-
-
-def _mismatch(rms: float, old: Calibration) -> tuple[str, ...]:
-    """Return a warning of readings some of which are far off, by the rms of |f| - g in the unit of the result."""
-    warning = (
-        f"Under the result the new readings miss g by {rms:.3g} {old.unit}: are they in another unit than its "
-        "readings, or from another sensor?"
-    )
-    return () if rms < MISMATCH * old.g else (warning,)
 
 
 def _reasons(

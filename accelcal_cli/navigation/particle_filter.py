@@ -218,8 +218,8 @@ class ParticleFilter(Filter):
     ) -> tuple[Cloud, float, Bool]:
         """Return the cloud weighed by the measurement of epoch k, look-ups per run, and which runs are on the map."""
         likelihood = self.likelihood(scenario, k, cloud.x)
-        weighed = replace(cloud, log_weights=cloud.log_weights + likelihood)
-        return weighed, self.particles, likelihood.max(axis=1) > BLIND
+        on_map = likelihood.max(axis=1) > BLIND
+        return Cloud(cloud.x, cloud.log_weights + likelihood), self.particles, on_map
 
     def likelihood(self, scenario: Scenario, k: int, x: Float) -> Float:
         """Return the log-likelihood of particles x, shape (R, n, D), at epoch k."""

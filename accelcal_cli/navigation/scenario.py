@@ -279,10 +279,11 @@ def from_recording(
         meridian, parallel = metres_per_radian(indicated.latitude)
         north, east = indicated.latitude - true.latitude, indicated.longitude - true.longitude
         error = np.broadcast_to(np.stack([north * meridian, east * parallel], axis=-1), (*shape, 2))
-    if "gravity" in columns:
-        measured: Float = np.broadcast_to(columns["gravity"], shape)
-    else:
-        measured = _measure(gravity_map, true, noise, runs, seed)
+    measured = (
+        np.broadcast_to(columns["gravity"], shape)
+        if "gravity" in columns
+        else _measure(gravity_map, true, noise, runs, seed)
+    )
     turns = wrap_angle(np.diff(np.radians(columns["heading"]))) if "heading" in columns else indicated.turns()
     parts = (indicated.latitude, indicated.longitude, indicated.east, indicated.north)
     ins = Trajectory(columns["time"], *(np.broadcast_to(part, shape) for part in parts))
@@ -318,18 +319,16 @@ def check_coverage(gravity_map: GravityMap, trajectory: Trajectory, initial: flo
             unknown = np.isnan(gravity_map.at(latitude, longitude))
             if unknown.any():
                 k = int(np.argmax(unknown))
-                hour = float(trajectory.seconds[k]) / SECONDS_PER_HOUR
-                _refuse(gravity_map, np.degrees(latitude[k]), np.degrees(longitude[k]), hour)
+                raise DataError(_uncovered(gravity_map, latitude[k], longitude[k], trajectory.seconds[k]))
 
 
-def _refuse(gravity_map: GravityMap, latitude: float, longitude: float, hour: float) -> None:
-    """Raise DataError for a map without a value at a place in degrees."""
-    south, north, west, east = np.degrees(
-        [gravity_map.south, gravity_map.north, gravity_map.west, gravity_map.east]
-    )
+def _uncovered(gravity_map: GravityMap, latitude: float, longitude: float, seconds: float) -> str:
+    """Return the message for a map without a value at a place in rad, some seconds into the voyage."""
+    edges = (gravity_map.south, gravity_map.north, gravity_map.west, gravity_map.east)
+    south, north, west, east, latitude, longitude = np.degrees([*edges, latitude, longitude])
     inside = south <= latitude <= north and west <= longitude <= east
-    what = "has a cell without a value" if inside else "ends"
-    raise DataError(
-        f"{gravity_map.source}: the map {what} at {latitude:.4f} N {longitude:.4f} E, within the position error of the "
-        f"track at hour {hour:.2f}; it covers {south:.3f} to {north:.3f} N and {west:.3f} to {east:.3f} E"
+    return (
+        f"{gravity_map.source}: the map {'has a cell without a value' if inside else 'ends'} at {latitude:.4f} N "
+        f"{longitude:.4f} E, within the position error of the track at hour {seconds / SECONDS_PER_HOUR:.2f}; it "
+        f"covers {south:.3f} to {north:.3f} N and {west:.3f} to {east:.3f} E"
     )

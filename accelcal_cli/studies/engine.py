@@ -124,15 +124,14 @@ def run_study(
     tasks = study.tasks()
     total = sum(task.last - task.first for task in tasks)
     finished = sum(len(journal.done.get(task.key, ())) for task in tasks)
-    if progress:
-        progress(finished, total)
+    report = progress or (lambda _done, _total: None)
+    report(finished, total)
     pending = [task for task in tasks if task.key not in journal.done]
     with closing(_results(study, pending, executors)) as results:
         for task, records in results:
             journal.add(task, records)
             finished += len(records)
-            if progress:
-                progress(finished, total)
+            report(finished, total)
     return [record for task in tasks for record in journal.done[task.key]]
 
 

@@ -60,8 +60,7 @@ def rastrigin(z: Float) -> Float:
 
 def griewank(z: Float) -> Float:
     """Return sum z_i^2 / 4000 - prod cos(z_i / sqrt(i)) + 1. [dpso2014] section 3.1."""
-    roots = np.sqrt(np.arange(1.0, z.shape[-1] + 1.0))
-    waves = np.multiply.reduce(np.cos(z / roots), axis=-1)
+    waves = np.multiply.reduce(np.cos(z / np.sqrt(np.arange(1.0, z.shape[-1] + 1.0))), axis=-1)
     return np.asarray(np.add.reduce(z * z, axis=-1) / 4000.0 - waves + 1.0)
 
 

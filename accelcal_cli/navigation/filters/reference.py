@@ -14,12 +14,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
-from accelcal_cli.navigation.particle_filter import FILTERS, Filter, PositionEstimates
+from accelcal_cli.navigation.particle_filter import CHUNK, FILTERS, Filter, PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
-CHUNK = 60
 NEGLIGIBLE = 1e-6
 """Weight below which a component is dropped."""
 
@@ -161,8 +160,11 @@ def _inflate(bank: Bank, initial: float, inflation: float) -> Bank:
     wrong = (bank.misfit > MISFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
     if not wrong.any():
         return bank
-    P = np.where(wrong[:, None, None], inflation * bank.P, bank.P)
-    return replace(bank, P=P, misfit=np.where(wrong, 1.0, bank.misfit))
+    return replace(
+        bank,
+        P=np.where(wrong[:, None, None], inflation * bank.P, bank.P),
+        misfit=np.where(wrong, 1.0, bank.misfit),
+    )
 
 
 def _merge(bank: Bank) -> Bank:
