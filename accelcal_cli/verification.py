@@ -32,9 +32,9 @@ from accelcal_cli.calibration.observability import (
 from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import modulus_errors, polish
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
@@ -256,8 +256,8 @@ def check_unit(old: Calibration, readings: Readings) -> None:
 
 
 def _errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[tuple[Float, Float]]:
-    """Yield e and f of one sensor block by block, shapes (B,) and (B, 3); see `modulus_errors`."""
-    for _, e, f in modulus_errors(Sample.of([readings]), model.K[None], model.D[None], g):
+    """Yield e and f of one sensor block by block, shapes (B,) and (B, 3); see `Sample.errors`."""
+    for _, e, f in Sample.of([readings]).errors(model.K[None], model.D[None], g):
         yield e[0], f[0]
 
 
