@@ -19,7 +19,7 @@ from accelcal_cli.io.readings import Readings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.verification.verify import verify
+from accelcal_cli.verification import verify
 
 LEVEL = 0.05
 G, NOISE = 9.80665, 2e-3

@@ -79,7 +79,7 @@ def command(
     from accelcal_cli.detection.capture import Capture
     from accelcal_cli.io.serial import file_lines, port_lines, readings
     from accelcal_cli.output.files import check_target, is_stream
-    from accelcal_cli.planning.design import candidates, distinct_poses
+    from accelcal_cli.planning import candidates, distinct_poses
     from accelcal_cli.sensor.model import OUTPUT_OF_1_G
 
     options.check_choice("--fixture", fixture, options.FIXTURES[:-1])

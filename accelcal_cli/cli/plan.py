@@ -14,7 +14,7 @@ from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.planning.plan import Plan
+    from accelcal_cli.planning import Plan
 
 MOST_POSES = 200
 FROM_NOTHING, NEXT = 12, 6
@@ -131,7 +131,7 @@ def _plan(
 ) -> Plan:
     import numpy as np
 
-    from accelcal_cli.planning.plan import plan
+    from accelcal_cli.planning import plan
     from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
     existing = 0 if so_far is None else so_far.poses

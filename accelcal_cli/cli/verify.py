@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from accelcal_cli.cli import options, process
 from accelcal_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
 
 in_test = options.panel("Test")
 
@@ -48,7 +45,7 @@ def command(
     that --tolerance was missed.
     """
     from accelcal_cli.io.readings import read_readings
-    from accelcal_cli.verification.verify import verify
+    from accelcal_cli.verification import verify
     from accelcal_cli.views.verification import blocks, differences
 
     options.check_input(data)

@@ -76,6 +76,12 @@ class EvolvingFilter(ParticleFilter):
         return self.evolution(self, scenario, cloud, k, streams)
 
 
+def best_particle(x: Float, fitness: Float) -> tuple[Float, Float]:
+    """Return the best particle, shape (R, 1, 2), and its fitness, shape (R, 1)."""
+    index = fitness.argmax(axis=1)[:, None]
+    return np.take_along_axis(x, index[:, :, None], axis=1), np.take_along_axis(fitness, index, axis=1)
+
+
 Evolution = Callable[[EvolvingFilter, Scenario, Cloud, int, Streams], tuple[Cloud, float, Bool]]
 """A strategy: which particles of a filter move at an epoch, and toward what; see `ParticleFilter.update`."""
 

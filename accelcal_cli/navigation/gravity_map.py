@@ -266,8 +266,7 @@ PRESETS = {
 def covariance(distance: Float, field: RandomField) -> Float:
     """Return the covariance in mGal^2 at a distance in km, any shape."""
     s = distance / field.distance
-    total: Float = field.sigma**2 * (1.0 + s + s * s / 3.0) * np.exp(-s)
-    return total
+    return np.asarray(field.sigma**2 * (1.0 + s + s * s / 3.0) * np.exp(-s))
 
 
 def generate(field: RandomField, seed: int, source: str = "generated") -> GravityMap:

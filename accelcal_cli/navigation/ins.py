@@ -66,10 +66,9 @@ def metres_per_radian(latitude: Float) -> tuple[Float, Float]:
 def somigliana_gravity(latitude: Float) -> Float:
     """Return normal gravity on the ellipsoid in m/s^2, by Somigliana's formula; latitude in rad, any shape."""
     sine = np.sin(latitude) ** 2
-    gravity: Float = (
+    return np.asarray(
         EQUATORIAL_GRAVITY * (1.0 + SOMIGLIANA * sine) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine)
     )
-    return gravity
 
 
 @dataclass(frozen=True)
@@ -155,8 +154,7 @@ def turn_biases(F: Float, heading: Float) -> Float:
     for first in (7, 9):
         turn[..., first, first] = turn[..., first + 1, first + 1] = np.cos(heading)
         turn[..., first, first + 1], turn[..., first + 1, first] = np.sin(heading), -np.sin(heading)
-    product: Float = turn @ F
-    return product
+    return np.asarray(turn @ F)
 
 
 def to_metric(F: Float, before: Float, after: Float) -> Float:

@@ -188,8 +188,7 @@ def cholesky(P: Float) -> Float:
     sigma = np.sqrt(np.einsum("rii->ri", P))
     correlation = P / (sigma[:, :, None] * sigma[:, None, :])
     correlation = 0.5 * (correlation + correlation.swapaxes(1, 2)) + TINY * np.eye(STATES)
-    root: Float = np.linalg.cholesky(correlation) * sigma[:, :, None]
-    return root
+    return np.asarray(np.linalg.cholesky(correlation) * sigma[:, :, None])
 
 
 @dataclass(frozen=True)
@@ -271,8 +270,7 @@ class MarginalFilter:
             return np.where(inside, density, -np.inf)
 
         def rate(v: Float) -> Float:
-            total: Float = prior(v) + window.likelihoods(v, self.variance).sum(axis=1)
-            return total
+            return np.asarray(prior(v) + window.likelihoods(v, self.variance).sum(axis=1))
 
         level: Float = likelihood + prior(u)
         settled = []

@@ -102,8 +102,7 @@ def normalise(log_weights: Float) -> Float:
 
 def effective_size(weights: Float) -> Float:
     """Return N_eff = 1 / sum w^2, shape (R,). [depf2015] eq. 2."""
-    size: Float = 1.0 / np.square(weights).sum(axis=1)
-    return size
+    return np.asarray(1.0 / np.square(weights).sum(axis=1))
 
 
 def systematic(weights: Float, u: Float) -> Int:
@@ -157,8 +156,7 @@ def moments(weights: Float, x: Float) -> tuple[Float, Float]:
 
 def take_particles(x: Float, index: Int) -> Float:
     """Return the particles at index (R, n) of x (R, N, D), shape (R, n, D), population-contiguous as streams are."""
-    taken: Float = np.take_along_axis(x.swapaxes(1, 2), index[:, None], axis=2).swapaxes(1, 2)
-    return taken
+    return np.asarray(np.take_along_axis(x.swapaxes(1, 2), index[:, None], axis=2).swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
@@ -220,8 +218,8 @@ class ParticleFilter(Filter):
     ) -> tuple[Cloud, float, Bool]:
         """Return the cloud weighed by the measurement of epoch k, look-ups per run, and which runs are on the map."""
         likelihood = self.likelihood(scenario, k, cloud.x)
-        weighed = replace(cloud, log_weights=cloud.log_weights + likelihood)
-        return weighed, self.particles, likelihood.max(axis=1) > BLIND
+        on_map = likelihood.max(axis=1) > BLIND
+        return Cloud(cloud.x, cloud.log_weights + likelihood), self.particles, on_map
 
     def likelihood(self, scenario: Scenario, k: int, x: Float) -> Float:
         """Return the log-likelihood of particles x, shape (R, n, D), at epoch k."""
@@ -236,8 +234,7 @@ class ParticleFilter(Filter):
 
     def degenerate(self, weights: Float) -> Bool:
         """Return which runs have too small an effective size, shape (R,)."""
-        low: Bool = effective_size(weights) < self.threshold * self.particles
-        return low
+        return np.asarray(effective_size(weights) < self.threshold * self.particles)
 
     def _start(self, scenario: Scenario, streams: Streams) -> Cloud:
         """Return the particles of step 1: positions uniform in the initial square."""
@@ -249,12 +246,10 @@ class ParticleFilter(Filter):
         """Return the particles one step on: a random walk of the position, or all errors by the transition F."""
         rough = self.roughening * np.sqrt(scenario.period / 10.0)
         if F is None:
-            walked: Float = x + rough * streams.normal(self.particles, 2)
-            return walked
+            return np.asarray(x + rough * streams.normal(self.particles, 2))
         noise = streams.normal(self.particles, STATES)
         noise *= np.sqrt(process_noise(scenario.grade, scenario.period, rough))
-        moved: Float = (F @ x.swapaxes(1, 2)).swapaxes(1, 2) + noise
-        return moved
+        return np.asarray((F @ x.swapaxes(1, 2)).swapaxes(1, 2) + noise)
 
     def _resample(self, cloud: Cloud, weights: Float, streams: Streams) -> Cloud:
         """Return the cloud with equal weights in the runs whose effective size is too small."""

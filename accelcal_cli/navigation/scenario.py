@@ -101,7 +101,12 @@ class Scenario:
 
         At the indicated latitude and velocity, which is what a real filter has.
         """
-        return transitions(self.ins, self.turns, self.grade, first, last)
+        motion = Motion(*(values[..., first:last] for values in vars(self.ins.motion).values()))
+        F = discretise(dynamics(motion), self.period)
+        if self.grade.mounting == "strapdown":
+            F = turn_biases(F, np.append(self.turns, 0.0)[first:last])
+        after = np.minimum(np.arange(first + 1, last + 1), self.epochs - 1)
+        return to_metric(F, self.ins.latitude[..., first:last], self.ins.latitude[..., after])
 
     def prior(self) -> Float:
         """Return the variances of the metric states at the start, shape (12,)."""
@@ -115,8 +120,8 @@ class Scenario:
         """Return epochs `first` to `last` - 1 of some runs."""
         ins = self.ins
         fields = (v[rows, first:last] for v in (ins.latitude, ins.longitude, ins.east, ins.north))
-        part = Trajectory(ins.seconds[first:last], *fields)
-        return replace(self, ins=part, measured=self.measured[rows, first:last], error=None)
+        ins = Trajectory(ins.seconds[first:last], *fields)
+        return replace(self, ins=ins, measured=self.measured[rows, first:last], error=None)
 
     def anomaly(self, k: int, north: Float, east: Float) -> Float:
         """Return the map's anomaly in mGal at epoch k for position errors in m, shape (R, ...); NaN off the map."""
@@ -125,16 +130,6 @@ class Scenario:
             v[:, k].reshape(shape) for v in (self.ins.latitude, self.ins.longitude, *self.scale)
         )
         return self.gravity_map.at(latitude - north / meridian, longitude - east / parallel)
-
-
-def transitions(trajectory: Trajectory, turns: Float, grade: InsGrade, first: int, last: int) -> Float:
-    """Return the metric transitions along a trajectory with these turns; see `Scenario.transitions`."""
-    motion = Motion(*(values[..., first:last] for values in vars(trajectory.motion).values()))
-    F = discretise(dynamics(motion), trajectory.step)
-    if grade.mounting == "strapdown":
-        F = turn_biases(F, np.append(turns, 0.0)[first:last])
-    after = np.minimum(np.arange(first + 1, last + 1), len(trajectory.seconds) - 1)
-    return to_metric(F, trajectory.latitude[..., first:last], trajectory.latitude[..., after])
 
 
 def simulate(
@@ -284,10 +279,11 @@ def from_recording(
         meridian, parallel = metres_per_radian(indicated.latitude)
         north, east = indicated.latitude - true.latitude, indicated.longitude - true.longitude
         error = np.broadcast_to(np.stack([north * meridian, east * parallel], axis=-1), (*shape, 2))
-    if "gravity" in columns:
-        measured: Float = np.broadcast_to(columns["gravity"], shape)
-    else:
-        measured = _measure(gravity_map, true, noise, runs, seed)
+    measured = (
+        np.broadcast_to(columns["gravity"], shape)
+        if "gravity" in columns
+        else _measure(gravity_map, true, noise, runs, seed)
+    )
     turns = wrap_angle(np.diff(np.radians(columns["heading"]))) if "heading" in columns else indicated.turns()
     parts = (indicated.latitude, indicated.longitude, indicated.east, indicated.north)
     ins = Trajectory(columns["time"], *(np.broadcast_to(part, shape) for part in parts))
@@ -323,18 +319,16 @@ def check_coverage(gravity_map: GravityMap, trajectory: Trajectory, initial: flo
             unknown = np.isnan(gravity_map.at(latitude, longitude))
             if unknown.any():
                 k = int(np.argmax(unknown))
-                hour = float(trajectory.seconds[k]) / SECONDS_PER_HOUR
-                _refuse(gravity_map, np.degrees(latitude[k]), np.degrees(longitude[k]), hour)
+                raise DataError(_uncovered(gravity_map, latitude[k], longitude[k], trajectory.seconds[k]))
 
 
-def _refuse(gravity_map: GravityMap, latitude: float, longitude: float, hour: float) -> None:
-    """Raise DataError for a map without a value at a place in degrees."""
-    south, north, west, east = np.degrees(
-        [gravity_map.south, gravity_map.north, gravity_map.west, gravity_map.east]
-    )
+def _uncovered(gravity_map: GravityMap, latitude: float, longitude: float, seconds: float) -> str:
+    """Return the message for a map without a value at a place in rad, some seconds into the voyage."""
+    edges = (gravity_map.south, gravity_map.north, gravity_map.west, gravity_map.east)
+    south, north, west, east, latitude, longitude = np.degrees([*edges, latitude, longitude])
     inside = south <= latitude <= north and west <= longitude <= east
-    what = "has a cell without a value" if inside else "ends"
-    raise DataError(
-        f"{gravity_map.source}: the map {what} at {latitude:.4f} N {longitude:.4f} E, within the position error of the "
-        f"track at hour {hour:.2f}; it covers {south:.3f} to {north:.3f} N and {west:.3f} to {east:.3f} E"
+    return (
+        f"{gravity_map.source}: the map {'has a cell without a value' if inside else 'ends'} at {latitude:.4f} N "
+        f"{longitude:.4f} E, within the position error of the track at hour {seconds / SECONDS_PER_HOUR:.2f}; it "
+        f"covers {south:.3f} to {north:.3f} N and {west:.3f} to {east:.3f} E"
     )

@@ -7,14 +7,14 @@ measurement matrix is the slope of the map at the true position.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.navigation.ins import metres_per_radian, process_noise
 from accelcal_cli.navigation.particle_filter import PositionEstimates
-from accelcal_cli.navigation.scenario import Scenario, transitions
+from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR
 
 SETTLED = 3.0
@@ -61,17 +61,15 @@ def score(scenario: Scenario, estimates: PositionEstimates) -> Scores:
     truth = np.full(estimates.mean.shape, np.nan) if scenario.error is None else scenario.error
     error = estimates.mean - truth
     square = np.square(error[:, late])
-    total = square.sum(axis=2)
     ins = np.square(truth[:, late]).sum(axis=2).mean(axis=1)
     variance = np.einsum("rkii->rk", estimates.covariance[:, late]).mean(axis=1)
     blind = estimates.blind > 0.5 * scenario.epochs
-    known = scenario.error is not None
-    lost = ~np.isfinite(estimates.mean).all(axis=(1, 2)) | blind
-    far = np.square(estimates.mean[:, -1] - truth[:, -1]).sum(axis=1)
-    if known:
-        astray = ~(total <= scenario.initial**2)
+    lost = diverged = ~np.isfinite(estimates.mean).all(axis=(1, 2)) | blind
+    if scenario.error is not None:
+        astray = ~(square.sum(axis=2) <= scenario.initial**2)
         lost = lost | astray[:, -1] | (astray.mean(axis=1) > ASTRAY)
-    diverged = lost & ~(far <= (DIVERGED * scenario.initial) ** 2) if known else lost
+        far = np.square(error[:, -1]).sum(axis=1)
+        diverged = lost & ~(far <= (DIVERGED * scenario.initial) ** 2)
     return Scores(
         error,
         square[..., 0].mean(axis=1),
@@ -89,8 +87,7 @@ def _nees(error: Float, covariance: Float) -> Float:
     a, b, c = covariance[..., 0, 0] + 1e-6, covariance[..., 0, 1], covariance[..., 1, 1] + 1e-6
     north, east = error[..., 0], error[..., 1]
     value: Float = ((c * north - 2.0 * b * east) * north + a * east**2) / (a * c - b * b)
-    mean: Float = value.mean(axis=1)
-    return mean
+    return np.asarray(value.mean(axis=1))
 
 
 def bound(scenario: Scenario) -> Float:
@@ -102,7 +99,7 @@ def bound(scenario: Scenario) -> Float:
     slope = np.stack(scenario.gravity_map.slope(true.latitude, true.longitude), axis=-1)
     slope /= np.stack(metres_per_radian(true.latitude), axis=-1)
     slope[np.isnan(slope).any(axis=1) | np.isnan(scenario.measured[0])] = 0.0
-    F = transitions(true, scenario.turns, scenario.grade, 0, scenario.epochs)
+    F = replace(scenario, ins=true).transitions(0, scenario.epochs)
     Q = np.diag(process_noise(scenario.grade, scenario.period))
     P = np.diag(scenario.prior())
     out = np.empty((scenario.epochs, 2))

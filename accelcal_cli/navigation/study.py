@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -59,7 +60,7 @@ class FilterEntry:
         """Return the filter with settings of the command line; None, and a setting that it lacks, are left out."""
         known = {f.name for f in fields(FILTERS.get(self.filter))}
         own = {name: value for name, value in stated.items() if value is not None and name in known}
-        return replace(self, parameters={**self.parameters, **own})
+        return replace(self, parameters=self.parameters | own)
 
 
 def filter_names() -> list[str]:
@@ -133,17 +134,17 @@ class NavigationSettings:
             DataError: a file that cannot be used, or a map that ends near the trajectory.
         """
         gravity_map, seed, noise, initial = self.gravity_map(), self.seed, self.noise, self.initial
-        if self.voyage:
-            columns = read_voyage(self.voyage, self.period)
-            recorded = from_recording(
-                columns, gravity_map, grade, runs=runs, seed=seed, noise=noise, initial=initial
-            )
-            check_coverage(gravity_map, recorded.true, initial)
-            return recorded
-        check_coverage(gravity_map, self.plan.trajectory(), initial)
-        return simulate(
-            gravity_map, self.plan, grade, runs=runs, seed=seed, period=self.period, noise=noise, initial=initial
-        )  # fmt: skip
+        if not self.voyage:
+            check_coverage(gravity_map, self.plan.trajectory(), initial)
+            return simulate(
+                gravity_map, self.plan, grade, runs=runs, seed=seed, period=self.period, noise=noise, initial=initial
+            )  # fmt: skip
+        columns = read_voyage(self.voyage, self.period)
+        recorded = from_recording(
+            columns, gravity_map, grade, runs=runs, seed=seed, noise=noise, initial=initial
+        )
+        check_coverage(gravity_map, recorded.true, initial)
+        return recorded
 
 
 def load_study(path: Path | str | None, stated: Mapping[str, Any]) -> NavigationSettings:
@@ -310,10 +311,8 @@ def statistics(study: Navigation, records: Sequence[Record]) -> list[Row]:
         lost, diverged: numbers of runs; nees: mean normalised error squared; lookups: of the map, per run and epoch.
         seconds: time of all runs, s; epoch_us: of one run and epoch, microseconds.
     """
-    bounds = []
-    for grade in study.grades:
-        scenario = study.settings.scenario(grade, range(1))
-        bounds.append(float(np.sqrt(bound(scenario)[counted(scenario)].sum(axis=1).mean())))
+    scenarios = (study.settings.scenario(grade, range(1)) for grade in study.grades)
+    bounds = [float(np.sqrt(bound(s)[counted(s)].sum(axis=1).mean())) for s in scenarios]
     return [
         _row(study, cell, records_of_cell(records, cell), bounds[cell // len(study.entries)])
         for cell in range(study.cells)
@@ -395,24 +394,22 @@ def _limits(study: Navigation, grade: InsGrade) -> list[tuple[Any, ...]]:
     scenario = study.settings.scenario(grade, range(study.runs))
     at = slice(None, None, _stride(scenario))
     indicated = np.degrees([scenario.ins.latitude[0, at], scenario.ins.longitude[0, at]]).T
-    alone: Any = [(None, None)] * len(indicated)
-    if scenario.error is not None:
-        alone = np.square(scenario.error[:, at]).mean(axis=0)
-    rows: list[tuple[Any, ...]] = []
-    for name, squares in ((INS, alone), (BOUND, bound(scenario)[at])):
-        for k, second in enumerate(scenario.seconds[at]):
-            place = indicated[k] if name == INS else (None, None)
-            label = name, "", float(f"{grade.accelerometer:.6g}")
-            rows.append((*label, round(second), *_roots(*squares[k]), *place, None))
-    return rows
+    nowhere: Any = [(None, None)] * len(indicated)
+    alone = nowhere if scenario.error is None else np.square(scenario.error[:, at]).mean(axis=0)
+    label = "", float(f"{grade.accelerometer:.6g}")
+    return [
+        (name, *label, round(second), *_roots(*squares[k]), *places[k], None)
+        for name, squares, places in ((INS, alone, indicated), (BOUND, bound(scenario)[at], nowhere))
+        for k, second in enumerate(scenario.seconds[at])
+    ]
 
 
 def _mean_squares(records: Sequence[Record], axis: str) -> dict[int, float]:
     """Return the mean square over runs at each second."""
-    squares: dict[int, list[float]] = {}
+    squares: defaultdict[int, list[float]] = defaultdict(list)
     for record in records:
         for second, value in axis_of(record, axis).items():
-            squares.setdefault(second, []).append(value**2)
+            squares[second].append(value**2)
     return {second: float(np.mean(values)) for second, values in squares.items()}
 
 

@@ -9,7 +9,7 @@ similar to the paper's.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -115,8 +115,7 @@ class Trajectory:
 
     def at(self, epochs: Int | slice) -> Trajectory:
         """Return the trajectory at some of its epochs."""
-        parts = (self.latitude, self.longitude, self.east, self.north)
-        return Trajectory(self.seconds[epochs], *(part[..., epochs] for part in parts))
+        return Trajectory(*(getattr(self, f.name)[..., epochs] for f in fields(self)))
 
     def turns(self) -> Float:
         """Return the changes of heading between epochs, clockwise, rad, shape (..., K - 1)."""
@@ -131,8 +130,7 @@ class Trajectory:
 
 def wrap_angle(angle: Float) -> Float:
     """Return angles between -pi and pi, rad."""
-    nearest: Float = np.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
-    return nearest
+    return np.asarray(np.remainder(angle + math.pi, 2.0 * math.pi) - math.pi)
 
 
 def _integral(rate: Float) -> Float:
@@ -168,7 +166,7 @@ def _transitions(trajectory: Trajectory, grade: InsGrade) -> Float:
     A = dynamics(trajectory.motion)
     middle = 0.5 * (A[1:] + A[:-1])
     h = trajectory.step
-    F: Float = np.eye(STATES) + h * middle + 0.5 * h * h * middle @ A[:-1]
+    F = np.eye(STATES) + h * middle + 0.5 * h * h * middle @ A[:-1]
     return turn_biases(F, trajectory.turns()) if grade.mounting == "strapdown" else F
 
 
@@ -201,8 +199,5 @@ def _initial_errors(
 
 def _aligned(up: float, latitude: float, biases: Float) -> Float:
     """Return the errors, shape (12,), that a self-alignment leaves; `up`: specific force, m/s^2; latitude: rad."""
-    x = np.zeros(STATES)
-    x[7:] = biases
-    x[4], x[5] = -biases[1] / up, biases[0] / up
-    x[6] = biases[2] / (EARTH_RATE * math.cos(latitude))
-    return x
+    tilts = -biases[1] / up, biases[0] / up, biases[2] / (EARTH_RATE * math.cos(latitude))
+    return np.concatenate([np.zeros(4), tilts, biases])

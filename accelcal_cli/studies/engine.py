@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Executor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, closing, suppress
@@ -124,15 +124,14 @@ def run_study(
     tasks = study.tasks()
     total = sum(task.last - task.first for task in tasks)
     finished = sum(len(journal.done.get(task.key, ())) for task in tasks)
-    if progress:
-        progress(finished, total)
+    report = progress or (lambda _done, _total: None)
+    report(finished, total)
     pending = [task for task in tasks if task.key not in journal.done]
     with closing(_results(study, pending, executors)) as results:
         for task, records in results:
             journal.add(task, records)
             finished += len(records)
-            if progress:
-                progress(finished, total)
+            report(finished, total)
     return [record for task in tasks for record in journal.done[task.key]]
 
 
@@ -150,16 +149,12 @@ def _results(
         before = len(left)
         try:
             with executors() as executor:
-                for task, records in _completed(executor, study, list(left.values())):
-                    del left[task.key]
-                    yield task, records
+                futures = {executor.submit(study.execute, task): task for task in left.values()}
+                for future in as_completed(futures):
+                    records = future.result()
+                    del left[futures[future].key]
+                    yield futures[future], records
         except BrokenProcessPool:
             vain = vain + 1 if len(left) == before else 0
             if vain == POOLS:
                 raise DataError(f"workers died {POOLS} times in a row without finishing a run") from None
-
-
-def _completed(executor: Executor, study: Study, tasks: list[Task]) -> Iterator[tuple[Task, list[Record]]]:
-    futures = {executor.submit(study.execute, task): task for task in tasks}
-    for future in as_completed(futures):
-        yield futures[future], future.result()

@@ -28,8 +28,7 @@ STYBLINSKI_LEVEL = STYBLINSKI_POINT**4 - 16.0 * STYBLINSKI_POINT**2 + 5.0 * STYB
 
 def sphere(z: Float) -> Float:
     """Return sum z_i^2. [dpso2014] section 3.1."""
-    total: Float = np.add.reduce(z * z, axis=-1)
-    return total
+    return np.asarray(np.add.reduce(z * z, axis=-1))
 
 
 def rosenbrock(z: Float) -> Float:
@@ -42,8 +41,7 @@ def rosenbrock(z: Float) -> Float:
     slope = first - 1.0
     slope *= slope
     valley += slope
-    total: Float = np.add.reduce(valley, axis=-1)
-    return total
+    return np.asarray(np.add.reduce(valley, axis=-1))
 
 
 def modified_rosenbrock(z: Float) -> Float:
@@ -57,24 +55,20 @@ def rastrigin(z: Float) -> Float:
     waves *= -10.0
     waves += z * z
     waves += 10.0
-    total: Float = np.add.reduce(waves, axis=-1)
-    return total
+    return np.asarray(np.add.reduce(waves, axis=-1))
 
 
 def griewank(z: Float) -> Float:
     """Return sum z_i^2 / 4000 - prod cos(z_i / sqrt(i)) + 1. [dpso2014] section 3.1."""
-    roots = np.sqrt(np.arange(1.0, z.shape[-1] + 1.0))
-    waves = np.multiply.reduce(np.cos(z / roots), axis=-1)
-    total: Float = np.add.reduce(z * z, axis=-1) / 4000.0 - waves + 1.0
-    return total
+    waves = np.multiply.reduce(np.cos(z / np.sqrt(np.arange(1.0, z.shape[-1] + 1.0))), axis=-1)
+    return np.asarray(np.add.reduce(z * z, axis=-1) / 4000.0 - waves + 1.0)
 
 
 def ackley(z: Float) -> Float:
     """Return Ackley's function: 20 + e - 20 exp(-0.2 rms(z)) - exp(mean cos(2 pi z)). [jamil2013] 1."""
     rms = np.sqrt(np.mean(z * z, axis=-1))
     total = 20.0 + math.e - 20.0 * np.exp(-0.2 * rms) - np.exp(np.mean(np.cos(2 * math.pi * z), axis=-1))
-    least: Float = np.maximum(total, 0.0)  # rounding would leave -4e-16
-    return least
+    return np.asarray(np.maximum(total, 0.0))  # rounding would leave -4e-16
 
 
 def schwefel(z: Float) -> Float:
@@ -82,8 +76,7 @@ def schwefel(z: Float) -> Float:
     inside = np.clip(z, -500.0, 500.0)
     waves = inside * np.sin(np.sqrt(np.abs(inside)))
     beyond = z - inside
-    total: Float = np.add.reduce(SCHWEFEL_LEVEL - waves + beyond * beyond, axis=-1)
-    return total
+    return np.asarray(np.add.reduce(SCHWEFEL_LEVEL - waves + beyond * beyond, axis=-1))
 
 
 def levy(z: Float) -> Float:
@@ -92,21 +85,18 @@ def levy(z: Float) -> Float:
     head = np.sin(math.pi * w[..., 0]) ** 2
     body = (w[..., :-1] - 1.0) ** 2 * (1.0 + 10.0 * np.sin(math.pi * w[..., :-1] + 1.0) ** 2)
     tail = (w[..., -1] - 1.0) ** 2 * (1.0 + np.sin(2.0 * math.pi * w[..., -1]) ** 2)
-    total: Float = head + np.add.reduce(body, axis=-1) + tail
-    return total
+    return np.asarray(head + np.add.reduce(body, axis=-1) + tail)
 
 
 def zakharov(z: Float) -> Float:
     """Return s + t^2 + t^4 with s = sum z_i^2, t = sum i z_i / 2. [jamil2013] 173."""
-    t = z @ (0.5 * np.arange(1.0, z.shape[-1] + 1.0))
-    total: Float = np.add.reduce(z * z, axis=-1) + t**2 + t**4
-    return total
+    t = z @ _ramp(z)
+    return np.asarray(np.add.reduce(z * z, axis=-1) + t**2 + t**4)
 
 
 def elliptic(z: Float) -> Float:
     """Return sum 10^(6 (i - 1) / (D - 1)) z_i^2: a bowl a thousand times as long as wide. [hansen2016]."""
-    total: Float = np.add.reduce(elliptic_weights(z.shape[-1]) * (z * z), axis=-1)
-    return total
+    return np.asarray(np.add.reduce(elliptic_weights(z.shape[-1]) * (z * z), axis=-1))
 
 
 def elliptic_weights(dimensions: int) -> Float:
@@ -118,8 +108,7 @@ def styblinski_tang(z: Float) -> Float:
     """Return sum (z_i^4 - 16 z_i^2 + 5 z_i) / 2 above its least value, -39.166 D. [jamil2013] 144."""
     square = z * z
     total = np.add.reduce(square * square - 16.0 * square + 5.0 * z - STYBLINSKI_LEVEL, axis=-1)
-    least: Float = np.maximum(0.5 * total, 0.0)  # rounding would leave -1e-14
-    return least
+    return np.asarray(np.maximum(0.5 * total, 0.0))  # rounding would leave -1e-14
 
 
 def _diagonal(z: Float, weights: Float) -> Float:
@@ -132,8 +121,7 @@ def _identity(z: Float) -> Float:
 
 
 def _elliptic_roots(z: Float) -> Float:
-    root: Float = np.sqrt(elliptic_weights(z.shape[-1]))
-    return root
+    return np.asarray(np.sqrt(elliptic_weights(z.shape[-1])))
 
 
 def _valley(z: Float) -> Float:
@@ -159,9 +147,8 @@ def _zakharov(z: Float) -> Float:
 
 
 def _zakharov_jacobian(z: Float) -> Float:
-    slope = _ramp(z)
-    t = z @ slope
-    last = np.broadcast_to(slope, z.shape)
+    last = np.broadcast_to(_ramp(z), z.shape)
+    t = z @ _ramp(z)
     return np.concatenate(
         [_identity(z), last[..., None, :], (2.0 * t[..., None] * last)[..., None, :]],
         axis=-2,
@@ -229,13 +216,17 @@ def select(names: Sequence[str]) -> tuple[str, ...]:
         ConfigError: an unknown name.
     """
     for name in names:
-        if name != "all" and name not in FUNCTIONS:
-            raise ConfigError(_unknown(name))
+        if name != "all":
+            _definition(name)
     return tuple(FUNCTIONS) if "all" in names else tuple(names) or PAPER
 
 
-def _unknown(name: str) -> str:
-    return f'unknown function "{name}"{did_you_mean(name, FUNCTIONS)}; known: {", ".join(FUNCTIONS)}'
+def _definition(name: str) -> Definition:
+    if name not in FUNCTIONS:
+        raise ConfigError(
+            f'unknown function "{name}"{did_you_mean(name, FUNCTIONS)}; known: {", ".join(FUNCTIONS)}'
+        )
+    return FUNCTIONS[name]
 
 
 class TestFunction(Problem):
@@ -259,10 +250,7 @@ class TestFunction(Problem):
         self, name: str, dimensions: int, *, shift: bool = False, rotate: bool = False, seed: int = 0
     ) -> None:
         """Draw the position of the optimum and the rotation."""
-        if name not in FUNCTIONS:
-            raise ConfigError(_unknown(name))
-        definition = FUNCTIONS[name]
-        self.name, self.definition = name, definition
+        self.name, self.definition = name, (definition := _definition(name))
         self.lower, self.upper = np.full((2, dimensions), [[float(definition.low)], [float(definition.high)]])
         if definition.start:
             low, high = definition.start
@@ -299,5 +287,4 @@ class TestFunction(Problem):
         if self._rotation is None:
             return z
         away = z - self.definition.optimum
-        turned: Float = (self._rotation @ away.swapaxes(1, 2)).swapaxes(1, 2) + self.definition.optimum
-        return turned
+        return np.asarray((self._rotation @ away.swapaxes(1, 2)).swapaxes(1, 2) + self.definition.optimum)

@@ -141,8 +141,7 @@ class Experiment(Study):
     def execute(self, task: Task) -> list[Record]:
         """Return the records of a task's runs."""
         part, own = self._locate(task.cell)
-        records = self.studies[part].execute(replace(task, cell=own))
-        return [replace(record, cell=task.cell) for record in records]
+        return [replace(r, cell=task.cell) for r in self.studies[part].execute(replace(task, cell=own))]
 
     def records_of(self, part: int, records: Sequence[Record]) -> list[Record]:
         """Return the records of one part, its cells numbered as in its own study."""

@@ -210,8 +210,7 @@ MATRIX = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23"
 
 def success_limit(least: Float, tolerance: float) -> Float:
     """Return the cost at or below which a run has succeeded, same shape as the least cost."""
-    highest: Float = np.maximum(least + tolerance, (1.0 + WITHIN) * least)
-    return highest
+    return np.asarray(np.maximum(least + tolerance, (1.0 + WITHIN) * least))
 
 
 def parameter_errors(K: Float, D: Float, block: CalibrationBlock, noise: float) -> dict[str, Float]:
@@ -249,8 +248,7 @@ def _angles(K: Float) -> Float:
 
 
 def _rms(values: Float) -> Float:
-    root: Float = np.sqrt(np.mean(values**2, axis=1))
-    return root
+    return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
 
 
 def in_lower(K: Float) -> Float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED
-from accelcal_cli.planning.plan import Plan
+from accelcal_cli.planning import Plan
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.poses import describe
 from accelcal_cli.table import Column, Table

@@ -17,10 +17,10 @@ from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.planning.plan import plan
+from accelcal_cli.planning import plan
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.verification.verify import verify
+from accelcal_cli.verification import verify
 from accelcal_cli.views.calibration import tables
 from accelcal_cli.views.plan import pose_table
 
@@ -106,7 +106,7 @@ def test_what_does_not_go_with_it_is_refused(other):
 def test_fleet_and_verify_want_misalignments():
     with pytest.raises(ConfigError, match="misalignment: False"):
         check_settings(SIX)
-    with pytest.raises(DataError, match="took its axes as perpendicular"):
+    with pytest.raises(DataError, match="assumes perpendicular axes"):
         verify(calibrate(read(poses.turns(), sigma=1e-2), SIX), read(poses.turns(), sigma=1e-2, seed=2))
 
 

@@ -16,7 +16,7 @@ from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.navigation.gravity_map import PRESETS
 from accelcal_cli.navigation.particle_filter import FILTERS
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.planning.design import FIXTURES
+from accelcal_cli.planning import FIXTURES
 from accelcal_cli.sensor.model import Gauge
 from accelcal_cli.sensor.poses import SCHEMES
 from accelcal_cli.studies.functions import FUNCTIONS

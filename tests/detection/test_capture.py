@@ -20,7 +20,7 @@ from accelcal_cli.detection.capture import Capture, fit_rough_sensor
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.readings import read_readings
 from accelcal_cli.io.serial import port_lines
-from accelcal_cli.planning.design import candidates, distinct_poses
+from accelcal_cli.planning import candidates, distinct_poses
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 

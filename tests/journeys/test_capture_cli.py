@@ -7,7 +7,7 @@ import pytest
 
 from accelcal_cli.errors import OutputError
 from accelcal_cli.output import live as capture
-from accelcal_cli.planning.design import candidates, distinct_poses
+from accelcal_cli.planning import candidates, distinct_poses
 from accelcal_cli.rng import Streams
 
 FAST = ("--port", "-", "--rate", "20", "--window", "1", "--hold", "2")

@@ -64,7 +64,7 @@ def test_readings_in_another_unit_are_told(run, result, other):
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err == (
         "accelcal: g.csv: under the result no pose is near g = 9.80665 m/s^2, most have 0.685; are they in another "
-        "unit than its readings, or of another sensor?\n"
+        "unit than its readings, or from another sensor?\n"
     )
 
 

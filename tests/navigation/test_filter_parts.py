@@ -12,7 +12,7 @@ from accelcal_cli.navigation.gravity_map import PRESETS, generate
 from accelcal_cli.navigation.ins import InsGrade, metres_per_radian
 from accelcal_cli.navigation.marginal import Gaussian, MarginalFilter, TrackWindow, de_mc_generation
 from accelcal_cli.navigation.particle_filter import FILTERS, Cloud, PositionEstimates, normalise
-from accelcal_cli.navigation.scenario import simulate, transitions
+from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import bound
 from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
@@ -50,7 +50,7 @@ def test_the_bound_is_the_covariance_of_a_kalman_filter_on_the_true_track(voyage
         )
         / 0.02
     )
-    F = transitions(true, voyage.turns, voyage.grade, 0, voyage.epochs)
+    F = dataclasses.replace(voyage, ins=true).transitions(0, voyage.epochs)
     Q, P = step_noise(voyage.grade, voyage.period), np.diag(voyage.prior())
     expected = np.empty((voyage.epochs, 2))
     for k in range(voyage.epochs):

@@ -41,8 +41,7 @@ def masses(fitness: Float) -> Float:
     best = fitness.max(axis=1, keepdims=True)
     weights = np.exp(fitness - best)
     span = 1.0 - weights.min(axis=1, keepdims=True)
-    mass: Float = np.exp((weights - 1.0) / np.where(span > 0, span, 1.0))
-    return mass
+    return np.asarray(np.exp((weights - 1.0) / np.where(span > 0, span, 1.0)))
 
 
 def forces(x: Float, fitness: Float) -> Float:

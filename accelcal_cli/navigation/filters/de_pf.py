@@ -23,6 +23,7 @@ from accelcal_cli.navigation.evolution import (
     Evolution,
     EvolvingFilter,
     Fitness,
+    best_particle,
     evolve_degenerate,
     posterior,
 )
@@ -117,9 +118,7 @@ class DePf(EvolvingFilter):
         x, fitness = x.copy("K"), fitness.copy()
         F_span, CR_span = self.weight_max - self.weight_min, self.crossover_max - self.crossover_min
         for _ in range(self.generations):
-            best = fitness.argmax(axis=1)[:, None]
-            level = np.take_along_axis(fitness, best, axis=1)
-            leader = np.take_along_axis(x, best[:, :, None], axis=1)
+            leader, level = best_particle(x, fitness)
             distance = 1.0 - np.exp(fitness - level)
             worst = distance.max(axis=1, keepdims=True) + LAMBDA
             F = self.weight_min + F_span * distance[:, :movers] / worst  # [depf2015] eq. 4

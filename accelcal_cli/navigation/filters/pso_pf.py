@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.navigation.evolution import EvolvingFilter, Fitness
+from accelcal_cli.navigation.evolution import EvolvingFilter, Fitness, best_particle
 from accelcal_cli.navigation.particle_filter import FILTERS
 from accelcal_cli.rng import Streams
 
@@ -20,7 +20,7 @@ class PsoPf(EvolvingFilter):
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
         """Return the particles after `generations` of v = |n1| (pbest - x) + |n2| (gbest - x)."""
         place, own, own_fitness = x[:, :movers], x[:, :movers].copy(), fitness[:, :movers]
-        best, best_fitness = _best(x, fitness)
+        best, best_fitness = best_particle(x, fitness)
         for _ in range(self.generations):
             pull = np.abs(streams.normal(movers, 4))
             place = place + pull[..., :2] * (own - place) + pull[..., 2:] * (best - place)
@@ -28,13 +28,7 @@ class PsoPf(EvolvingFilter):
             better = new > own_fitness
             own = np.where(better[:, :, None], place, own)
             own_fitness = np.where(better, new, own_fitness)
-            challenger, value = _best(own, own_fitness)
+            challenger, value = best_particle(own, own_fitness)
             best = np.where((value > best_fitness)[:, :, None], challenger, best)
             best_fitness = np.maximum(value, best_fitness)
         return np.concatenate([place, x[:, movers:]], axis=1)
-
-
-def _best(x: Float, fitness: Float) -> tuple[Float, Float]:
-    """Return the best particle, shape (R, 1, 2), and its fitness, shape (R, 1)."""
-    index = fitness.argmax(axis=1)[:, None]
-    return np.take_along_axis(x, index[:, :, None], axis=1), np.take_along_axis(fitness, index, axis=1)

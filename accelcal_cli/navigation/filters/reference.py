@@ -7,19 +7,18 @@ together are merged.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
-from accelcal_cli.navigation.particle_filter import FILTERS, Filter, PositionEstimates
+from accelcal_cli.navigation.particle_filter import CHUNK, FILTERS, Filter, PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
-CHUNK = 60
 NEGLIGIBLE = 1e-6
 """Weight below which a component is dropped."""
 
@@ -51,9 +50,7 @@ class Bank:
 
     def at(self, chosen: Int | Bool) -> Bank:
         """Return some of the components."""
-        return Bank(
-            self.run[chosen], self.mean[chosen], self.P[chosen], self.log_weight[chosen], self.misfit[chosen]
-        )
+        return Bank(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
 @FILTERS.register("reference")
@@ -137,8 +134,7 @@ def _weights(bank: Bank, runs: int) -> Float:
     highest = np.full(runs, -np.inf)
     np.maximum.at(highest, bank.run, bank.log_weight)
     weight = np.exp(bank.log_weight - highest[bank.run])
-    normal: Float = weight / np.bincount(bank.run, weight, runs)[bank.run]
-    return normal
+    return np.asarray(weight / np.bincount(bank.run, weight, runs)[bank.run])
 
 
 def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
@@ -155,8 +151,7 @@ def _moments(bank: Bank, runs: int) -> tuple[Float, Float]:
 
 def _prune(bank: Bank, runs: int) -> Bank:
     """Return the bank without components of negligible weight."""
-    weight = _weights(bank, runs)
-    keep = ~(weight <= NEGLIGIBLE)  # a diverged run has NaN weights, and stays so
+    keep = ~(_weights(bank, runs) <= NEGLIGIBLE)  # a diverged run has NaN weights, and stays so
     return bank if keep.all() else bank.at(keep)
 
 
@@ -165,15 +160,19 @@ def _inflate(bank: Bank, initial: float, inflation: float) -> Bank:
     wrong = (bank.misfit > MISFIT) & (bank.P[:, 0, 0] + bank.P[:, 1, 1] < initial**2)
     if not wrong.any():
         return bank
-    P = np.where(wrong[:, None, None], inflation * bank.P, bank.P)
-    return replace(bank, P=P, misfit=np.where(wrong, 1.0, bank.misfit))
+    return replace(
+        bank,
+        P=np.where(wrong[:, None, None], inflation * bank.P, bank.P),
+        misfit=np.where(wrong, 1.0, bank.misfit),
+    )
 
 
 def _merge(bank: Bank) -> Bank:
     """Return the bank in which the heaviest component of each run has absorbed those that coincide with it."""
     keep = np.ones(len(bank.run), dtype=bool)
     log_weight = bank.log_weight.copy()
-    for first, last in _spans(bank.run):
+    edges = [0, *(np.flatnonzero(np.diff(bank.run)) + 1).tolist(), len(bank.run)]
+    for first, last in pairwise(edges):
         own = slice(first, last)
         top = first + int(log_weight[own].argmax())
         away = bank.mean[own, :2] - bank.mean[top, :2]
@@ -183,9 +182,3 @@ def _merge(bank: Bank) -> Bank:
         keep[own] = ~near
         keep[top] = True
     return replace(bank, log_weight=log_weight).at(keep)
-
-
-def _spans(run: Int) -> list[tuple[int, int]]:
-    """Return first and one past the last component of each run."""
-    edges = [0, *(np.flatnonzero(np.diff(run)) + 1).tolist(), len(run)]
-    return list(pairwise(edges))

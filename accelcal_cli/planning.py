@@ -1,11 +1,17 @@
-"""Which poses to take next: the ones that shrink the worst dilution of precision most."""
+"""Planning: which poses to take next, the ones that shrink the worst dilution of precision most.
+
+A plan starts from what the poses so far determine; `distinct_poses` from nothing, for a capture.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.observability import PRIOR, _score, design, next_poses
+from accelcal_cli.calibration.observability import PRIOR, Observability, _score, design, knowing, next_poses
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.sensor.poses import fixture_directions, grid
 
@@ -16,9 +22,66 @@ POWERS = (2.0, 16.0, np.inf)
 """Norms of the variances that an exchange minimises one after the other: the sum of squares shows the way where the
 largest one alone is tied, the last is the largest itself."""
 
-
 STARTED_POSES, FEWEST_STARTS = 300, 2
 """Random starts of an exchange: 300 poses over the number chosen, 2 at least."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The next poses.
+
+    Attributes:
+        poses: number of poses so far.
+        directions: unit specific force of the next, best first, shape (k, 3).
+        stages: what the poses determine before the first of them and after each, k + 1 entries.
+        noise: standard deviation of one pose in parts of g; None when not known.
+        so_far: the calibration of the poses so far; None when there are none.
+    """
+
+    poses: int
+    directions: Float
+    stages: tuple[Observability, ...]
+    noise: float | None
+    so_far: Calibration | None = None
+
+    @property
+    def verdict(self) -> str:
+        """What the verdict will be after the last pose."""
+        return "undetermined" if self.beyond_poses else self.stages[-1].verdict
+
+    @property
+    def beyond_poses(self) -> bool:
+        """Whether the calibration so far is undetermined for a reason that more poses do not change."""
+        if self.so_far is None or self.so_far.verdict != "undetermined":
+            return False
+        return self.stages[0].verdict != "undetermined"
+
+
+def plan(
+    information: Float,
+    poses: int,
+    count: int,
+    fixture: str,
+    noise: float | None,
+    so_far: Calibration | None = None,
+) -> Plan:
+    """Return the next `count` poses that shrink the worst sigma most.
+
+    Args:
+        information: J^T J of the poses so far, shape (9, 9); zeros when there are none.
+        poses: their number.
+        count: number of poses to add.
+        fixture: one of FIXTURES.
+        noise: standard deviation of one pose in parts of g; None when not known.
+        so_far: the calibration of the poses so far, whose verdict the plan carries on.
+    """
+    allowed = candidates(fixture)
+    held = np.zeros(9, dtype=bool) if so_far is None else so_far.held
+    directions = allowed[best_poses(knowing(information, held), allowed, count)]
+    rows = design(directions)
+    sums = [information + rows[:k].T @ rows[:k] for k in range(count + 1)]
+    stages = tuple(Observability.of(total, poses + k, held) for k, total in enumerate(sums))
+    return Plan(poses, directions, stages, noise, so_far)
 
 
 def candidates(fixture: str) -> Float:
@@ -34,7 +97,7 @@ def candidates(fixture: str) -> Float:
 def best_poses(information: Float, candidates: Float, count: int) -> list[int]:
     """Return the indices of the `count` candidates that together leave the smallest largest variance, best first.
 
-    Greedy choice looks one pose ahead. An exchange [fedorov1972] mends that: each pose in turn is replaced by the
+    Greedy choice looks one pose ahead. An exchange [fedorov1972] improves on that: each pose in turn is replaced by the
     candidate that suits the others best, until none is. From the greedy choice and from random ones, the best kept.
     """
     rows = design(candidates)

@@ -16,7 +16,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.verification.verify import verify
+from accelcal_cli.verification import verify
 from accelcal_cli.views.verification import differences, evidence
 
 G, SIGMA = 9.8, 2e-3
@@ -100,7 +100,7 @@ def test_six_faces_tell_of_scale_and_bias():
     assert same.directions == 6
     assert [d.name for d in same.differences if np.isnan(d.value)] == list(PARAMETERS[3:6])
     assert any("6 of 9 directions" in line for line in same.reasons)
-    assert any("nothing of their noise" in line for line in same.reasons)
+    assert any("leave no degrees of freedom" in line for line in same.reasons)
     changed = verify(result(), new(np.repeat(poses.faces(), 4, axis=0), moved(bias=(0.03, 0, 0))))
     assert changed.verdict == "changed"
     assert any(line == "Changed: bias x." for line in changed.reasons)
@@ -117,7 +117,7 @@ def test_a_little_more_noise_is_said_but_is_no_change():
     found = verify(result(), new(sigma=2 * SIGMA))
     assert found.verdict == "unchanged"
     assert found.noise_chance < 0.01
-    assert any("2.1 times the noise of the old" in line for line in found.reasons)
+    assert any("2.1 times the noise of the old ones" in line for line in found.reasons)
     assert found.s_new == pytest.approx(2 * SIGMA, rel=0.5)
 
 
@@ -127,7 +127,10 @@ def test_much_more_noise_tells_nothing(times, told):
     found = verify(result(), new(sigma=times * SIGMA))
     assert (found.verdict, found.passed) == ("inconclusive", False)
     assert any(f"have {told}" in line for line in found.reasons)
-    assert any("hidden in the noise of the new readings: measure again" in line for line in found.reasons)
+    assert any(
+        "noise of the new readings hides changes that the result would show. Measure again" in line
+        for line in found.reasons
+    )
     assert not any(d.changed for d in found.differences)
     assert any("of g (above 0.5%" in line for line in found.cautions) == (times > 5)
 
@@ -136,7 +139,7 @@ def test_a_change_that_noise_does_not_hide_is_one():
     found = verify(result(), new(model=moved(bias=(0, 2.0, 0)), sigma=20 * SIGMA))
     assert found.verdict == "changed"
     assert "Changed: bias y." in found.reasons
-    assert not any("hidden" in line for line in found.reasons)
+    assert not any("hides" in line for line in found.reasons)
 
 
 def test_a_result_of_large_residuals_shows_nothing_unchanged():
@@ -144,7 +147,7 @@ def test_a_result_of_large_residuals_shows_nothing_unchanged():
     assert old.verdict == "good"
     found = verify(old, new())
     assert found.verdict == "inconclusive"
-    assert any(line.startswith("One pose of the result itself errs by 4.") for line in found.reasons)
+    assert any(line.startswith("A typical pose of the result itself is off by 4.") for line in found.reasons)
     assert verify(old, new(model=moved(bias=(0, 8.0, 0)))).verdict == "changed"
 
 
@@ -157,7 +160,7 @@ def test_rows_of_a_log_are_no_poses():
     found = verify(result(), Readings.from_array(MEMS.output(G * u + waves)))
     assert found.chance < 1e-9
     assert found.verdict == "inconclusive"
-    assert any("doubtful themselves" in line for line in found.reasons)
+    assert any("themselves are doubtful" in line for line in found.reasons)
     assert "6,000 rows are a log" in found.cautions[0]
 
 
@@ -271,7 +274,7 @@ def test_a_warm_sensor_is_the_one_that_it_was():
 @pytest.mark.parametrize(
     ("factor", "told"),
     [
-        (16377.0, "most have 0.00[0-9]*; are they in another unit than its readings, or of another sensor"),
+        (16377.0, "most have 0.00[0-9]*; are they in another unit than its readings, or from another sensor"),
         (1e9, "most have .*; are they in another unit"),
         (1e-9, "most have .*; are they in another unit"),
         (9.80665, "most have (1|0.99)[0-9.]*; they seem to be in g where those of the result are in m/s"),
@@ -297,8 +300,8 @@ def test_an_axis_that_died_is_a_matter_of_the_sensor():
 
 
 def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
-    monkeypatch.setattr("accelcal_cli.verification.verify.check_unit", lambda *_: None)
-    monkeypatch.setattr("accelcal_cli.verification.verify.doubts", lambda *_: ())
+    monkeypatch.setattr("accelcal_cli.verification.check_unit", lambda *_: None)
+    monkeypatch.setattr("accelcal_cli.verification.limitations_of", lambda *_: ())
     plain = ErrorModel(1670.0 * np.eye(3), np.zeros(3))
     old = calibrate(readings(TURNS, model=plain, sigma=SIGMA, seed=1), FAST)
     found = verify(old, Readings.from_array(new(poses.faces()[:2], model=plain).output() / 1e4))
@@ -312,5 +315,5 @@ def test_copies_are_no_new_readings_and_are_not_called_a_log():
     output = np.repeat(new(poses.edges()[:6]).output(), 4, axis=0)
     found = verify(result(), Readings.from_array(output))
     assert found.verdict == "inconclusive"
-    assert any("doubtful themselves, as the cautions say" in reason for reason in found.reasons)
+    assert any("themselves are doubtful, as the cautions say" in reason for reason in found.reasons)
     assert any("repeat another to the last digit" in caution for caution in found.cautions)

@@ -16,8 +16,7 @@ from accelcal_cli.calibration.observability import PARAMETERS, Observability, de
 from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimization.minimize import minimize
-from accelcal_cli.planning.design import FIXTURES, PRIOR, best_poses, candidates, distinct_poses
-from accelcal_cli.planning.plan import plan
+from accelcal_cli.planning import FIXTURES, PRIOR, best_poses, candidates, distinct_poses, plan
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.poses import fixture_directions

@@ -1,1 +1,0 @@
-"""Planning: which poses to take next."""

@@ -1,1 +1,0 @@
-"""Verification: an old result against new readings."""
