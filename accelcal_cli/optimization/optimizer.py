@@ -135,5 +135,4 @@ def optimizer_file(name: str) -> Path | None:
 def shipped_parameters(optimizer: object) -> dict[str, Any]:
     """Return the settings that the file of an optimizer states; none for an unknown one."""
     path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
-    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
-    return parameters
+    return dict(load_mapping(path).get("parameters") or {}) if path else {}

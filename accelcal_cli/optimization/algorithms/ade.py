@@ -62,20 +62,17 @@ class AdaptiveEvolution(Optimizer[State]):
         gene = (u[..., 2] * dimensions).astype(np.intp)
         take = (u[..., 3:] <= CR[..., None]) | (gene[..., None] == np.arange(dimensions))
         trial = np.where(take, mutant, x)  # [depf2015] eq. 5
-        trial_cost = problem.cost(trial)
-        return State(*better_of(x, fx, trial, trial_cost))  # [depf2015] eq. 7
+        return State(*better_of(x, fx, trial, problem.cost(trial)))  # [depf2015] eq. 7
 
     def _mutants(self, x: Float, fx: Float, F: Float, u: Float) -> Float:
         """Return the mutants, [depf2015] eq. 3."""
-        population = x.shape[1]
         towards = best_of(x, fx)[:, None] - x
-        first, second = partners(integers(u, population - 1, population - 2))
+        first, second = partners(integers(u, x.shape[1] - 1, x.shape[1] - 2))
         if self.mutation == "best-r":
             towards = towards + x - gather(x, first)
         else:
             towards += gather(x, first) - gather(x, second)
-        mutants: Float = x + F * towards
-        return mutants
+        return np.asarray(x + F * towards)
 
 
 def _distance(cost: Float, fx: Float) -> Float:

@@ -86,7 +86,9 @@ class HybridSwarm(Optimizer[HybridState]):
         x, curve = np.empty_like(state.x), self._curve(state.iteration)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
-        v = self._velocity(state, r1[:, :half], r2[:, :half], curve)
+        inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
+        swarm = (state.x[:, :half], state.velocity, state.memory[:, :half], state.leader)
+        v = velocity(*swarm, r1[:, :half], r2[:, :half], inertia, self.social, self.cognitive)
         clip(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
         individuals = state.memory[:, half:].copy(order="K")
@@ -111,13 +113,6 @@ class HybridSwarm(Optimizer[HybridState]):
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
         return float(1.0 / (1.0 + self.curve_a * self.curve_b ** (100.0 * iteration / self.iterations)))
-
-    def _velocity(self, state: HybridState, r1: Float, r2: Float, curve: float) -> Float:
-        """Return the swarm's velocities before their limit."""
-        half = state.velocity.shape[1]
-        inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
-        x, memory = state.x[:, :half], state.memory[:, :half]
-        return velocity(x, state.velocity, memory, state.leader, r1, r2, inertia, self.social, self.cognitive)
 
     def _change(self, x: Float, leader: Float, picks: Int, curve: float) -> Float:
         """Return what mutation adds to the evolving half.
