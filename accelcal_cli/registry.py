@@ -18,8 +18,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from accelcal_cli import schema
 from accelcal_cli.errors import ConfigError, did_you_mean
+from accelcal_cli.schema import from_mapping
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -107,7 +107,7 @@ class Registry(Generic[T]):
 
     def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
         """Build the class called `name` from `mapping`; see `schema.from_mapping`."""
-        return schema.from_mapping(self.get(name), mapping, where)
+        return from_mapping(self.get(name), mapping, where)
 
     def beside(self, name: str, suffix: str) -> Path | None:
         """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""

@@ -97,10 +97,9 @@ def minimize(
     parts = []
     for first in range(0, len(numbers), size):
         block = np.arange(first, min(first + size, len(numbers)))
-        x = None if start is None else start[block]
         loop = _Loop(problem.take(block) if size < len(numbers) else problem, optimizer, stopping, trace)
         with np.errstate(all="ignore"):
-            parts.append(loop.run(numbers[block], seed, x))
+            parts.append(loop.run(numbers[block], seed, None if start is None else start[block]))
         if progress:
             progress(int(block[-1]) + 1, len(numbers))
     return parts[0] if len(parts) == 1 else _join(parts)

@@ -16,21 +16,18 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.optimization.algorithms.pso import SwarmState
 from accelcal_cli.optimization.operators import best_of, better_of
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanState(State):
-    """A swarm with its filters; x is the filtered position."""
+class KalmanState(SwarmState):
+    """A swarm with its filters: x and velocity are filtered, memory is the paper's p, leader its g."""
 
-    velocity: Float  # filtered, (R, P, D)
-    memory: Float  # p, (R, P, D)
-    memory_cost: Float  # (R, P)
-    leader: Float  # g, (R, D)
     covariance: Float  # of (x, v, p, g) or (x, v), (R, k, k, P, D)
 
 

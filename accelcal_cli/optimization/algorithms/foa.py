@@ -61,7 +61,6 @@ class FruitFly(Optimizer[PlaneState]):
 
     def _candidates(self, problem: Problem, flies: Float, population: int) -> Float:
         """Return S = 1 / sqrt(X^2 + Y^2) in the box, shape (R, P, D) (step 3)."""
-        dimensions = flies.shape[2] // 2
-        distance = np.hypot(flies[..., :dimensions], flies[..., dimensions:])
+        distance = np.hypot(*np.split(flies, 2, axis=2))
         S = np.clip(1.0 / np.maximum(distance, 1e-12), problem.lower, problem.upper)
-        return np.broadcast_to(S, (len(S), population, dimensions))
+        return np.broadcast_to(S, (len(S), population, S.shape[2]))

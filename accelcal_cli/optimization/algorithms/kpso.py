@@ -51,8 +51,9 @@ class KalmanSwarm(Optimizer[FilterState]):
         fx = problem.cost(x)
         covariance = np.broadcast_to(self._q() * np.eye(2), (len(x), 2, 2))
         mean = (x - problem.lower) / problem.half_width - 1.0
-        leader = best_of(x, fx)[:, None]
-        return FilterState(x, fx, mean, np.zeros_like(mean), covariance, leader, fx.min(axis=1))
+        return FilterState(
+            x, fx, mean, np.zeros_like(mean), covariance, best_of(x, fx)[:, None], fx.min(axis=1)
+        )
 
     def step(self, problem: Problem, state: FilterState, rng: Streams) -> FilterState:
         """Observe, filter, predict, and sample the next positions."""

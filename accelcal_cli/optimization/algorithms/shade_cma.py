@@ -307,8 +307,7 @@ def _cma_step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> C
 
 def _sample(problem: Problem, state: CmaState, rng: Streams) -> tuple[Float, Float]:
     """Return new points, clipped to the box, and their steps from the mean over sigma, shapes (R, P, D)."""
-    z = rng.normal(*state.x.shape[1:])
-    y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
+    y = (rng.normal(*state.x.shape[1:]) * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
     mean, sigma = state.mean[:, None], state.sigma[:, None, None]
     sample = mean + sigma * y  # eq. 40
     x = np.clip(sample, *problem.limits)
