@@ -259,10 +259,7 @@ def _free(value: Any, label: str, depth: int = 4) -> Any:
     """Return a value of any kind, once no whole number in it, down to a depth, is too large for a float."""
     if isinstance(value, int):
         _float(value, label)
-    elif depth and isinstance(value, Mapping):
-        for key, part in value.items():
+    elif depth and isinstance(value, Mapping | list):
+        for key, part in value.items() if isinstance(value, Mapping) else enumerate(value):
             _free(part, f"{label}: {key}", depth - 1)
-    elif depth and isinstance(value, list):
-        for i, part in enumerate(value):
-            _free(part, f"{label}[{i}]", depth - 1)
     return value

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.schema import check, from_mapping, setting
+from accelcal_cli.schema import Limits, array, check, from_mapping, setting, to_mapping
 
 
 @dataclass(frozen=True)
@@ -173,3 +176,80 @@ def test_the_constructor_keeps_the_ranges_too():
         Outer(count=0)
     with pytest.raises(ConfigError, match="population"):
         OPTIMIZERS.get("de-pso")(population=3)
+
+
+@dataclass(frozen=True)
+class Part:
+    size: Annotated[float, Limits(none=math.inf)]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    matrix: Annotated[Float, array(2, 3, largest=10.0)]
+    gaps: Annotated[Float, array(2, none=math.nan)]
+    part: Part
+    many: tuple[Part, ...]
+    named: Annotated[dict[str, float], Limits(none=math.nan)]
+    words: Annotated[tuple[str, ...], Limits(older=("old",))]
+    free: dict[str, Any]
+    maybe: float | None = None
+
+
+PLAIN = {
+    "matrix": [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]],
+    "gaps": [1.5, None],
+    "part": {"size": None},
+    "many": [{"size": 1.0}, {"size": None}],
+    "named": {"a": 1.0, "b": None},
+    "words": ["new"],
+    "free": {"x": [1, {"y": None}]},
+    "maybe": None,
+}
+
+
+def test_a_record_comes_back_from_its_mapping():
+    record = from_mapping(Record, PLAIN, "r")
+    assert record.matrix.shape == (2, 3)
+    assert np.isnan(record.gaps[1])
+    assert (record.part, record.many) == (Part(math.inf), (Part(1.0), Part(math.inf)))
+    assert math.isnan(record.named["b"])
+    assert to_mapping(record) == PLAIN
+    assert list(to_mapping(record)) == list(PLAIN)
+
+
+def test_an_older_or_a_newer_record_is_read():
+    older = {key: value for key, value in PLAIN.items() if key not in ("words", "maybe")}
+    assert from_mapping(Record, older, "r").words == ("old",)
+    newer = {**PLAIN, "later": 1, "part": {"size": 2.0, "later": 1}}
+    assert from_mapping(Record, newer, "r", extra=True).part == Part(2.0)
+    with pytest.raises(ConfigError, match='r: part: unknown key "later"; known: size'):
+        from_mapping(Record, newer, "r")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"matrix": [[1, 2, 3]]}, "r: matrix: expected 2 x 3 numbers; matrix: expected 2 values, not 1"),
+        ({"matrix": [[1, 2, 3], [4, None, 6]]}, "matrix[1][1]: expected a number, not None"),
+        ({"matrix": [[1, 2, 3], [4, 11, 6]]}, "matrix[1][1]: 11.0 is too large; expected at most 10"),
+        ({"matrix": 3}, "r: matrix: expected 2 x 3 numbers; matrix: expected a list, not 3"),
+        ({"gaps": [1, math.inf]}, "gaps[1]: inf is not a finite number"),
+        ({"part": {}}, "r: part: missing: size"),
+        ({"part": 1}, "r: part: expected a mapping of keys, not 1"),
+        ({"many": [{"size": 1}, {"size": "a"}]}, "r: many[1]: size: expected a number, not 'a'"),
+        ({"named": {"a": []}}, "r: named: a: expected a number, not []"),
+        ({"words": ["a", 1]}, "r: words[1]: expected text, not 1"),
+        ({"free": {"x": {"y": 10**400}}}, "r: free: x: y: 1000000"),
+        ({"maybe": 10**400}, "is too large for a floating-point number"),
+    ],
+)
+def test_a_fault_of_a_record_is_named_with_its_place(changed, words):
+    with pytest.raises(ConfigError) as error:
+        from_mapping(Record, {**PLAIN, **changed}, "r")
+    assert words in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+def test_what_is_missing_is_named():
+    with pytest.raises(ConfigError, match="r: missing: matrix, free"):
+        from_mapping(Record, {k: v for k, v in PLAIN.items() if k not in ("matrix", "free")}, "r")

@@ -82,14 +82,15 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
     if settings.attitudes == "known":
         from accelcal_cli.calibration.known_attitudes import fit_known
 
-        return assess(fit_known(sample, settings))
-    stated = state(sample, settings)
-    solution = reweight(search(stated, closed=closed))
-    if sample.temperature is not None and settings.temperature:
-        from accelcal_cli.calibration.temperature import with_slopes
+        result = fit_known(sample, settings)
+    else:
+        stated = state(sample, settings)
+        solution = reweight(search(stated, closed=closed))
+        if sample.temperature is not None and settings.temperature:
+            from accelcal_cli.calibration.temperature import with_slopes
 
-        solution = with_slopes(solution)
-    result = fit(solution)
+            solution = with_slopes(solution)
+        result = fit(solution)
     return assess(result)
 
 

@@ -20,16 +20,8 @@ from accelcal_cli.calibration.observability import (
     design,
     propagate,
 )
-from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import (
-    NO_NOISE,
-    SLOPES,
-    Search,
-    Solution,
-    loss_slope,
-    loss_weight,
-    modulus_errors,
-)
+from accelcal_cli.calibration.sample import Sample, loss_slope, loss_weight
+from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.sensor.model import Gauge, to_gauge
 
@@ -146,25 +138,20 @@ class Fit:
 def fit(solution: Solution) -> Fit:
     """Fit a solution: one pass over the readings, everything for all sensors at once."""
     settings, sample = solution.stated.settings, solution.sample
-    g = settings.g
+    g, held = settings.g, None if settings.misalignment else ALIGNED
     K, D = solution.cost.parameters(solution.x)
-    nine, point = solution.plain.in_lower(K, D)
-    lower, own_D = nine.parameters(point)
-    information = nine.information(point)
-    if solution.slopes is not None:
-        information = information - solution.slopes.loss
-    held = None if settings.misalignment else ALIGNED
+    lower, own_D, information = _determined(solution, K, D)
     observability = Observability.of(information, sample.poses, held)
     freedom = sample.poses - min(9, solution.cost.unknowns) - SLOPES * (solution.slopes is not None)
     reading = _pass(solution, lower, own_D)
     residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
     variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
-    view, seen, sight = _first_sight(solution, observability, information, (lower, D))
     ratio, p = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
     at_wall = _at_wall(solution.x)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
     shown = to_gauge(K, settings.gauge)
     sigma_K, sigma_D = propagate(shown, lower, covariance, settings.gauge, g)
+    view, information, sight = _first_sight(solution, observability, information, (lower, D))
     return Fit(
         sample=sample,
         settings=settings,
@@ -179,7 +166,7 @@ def fit(solution: Solution) -> Fit:
         observability=observability,
         view=view,
         dop=view.dop,
-        information=seen,
+        information=information,
         sight=sight,
         freedom=freedom,
         s=np.sqrt(variance),
@@ -195,6 +182,14 @@ def fit(solution: Solution) -> Fit:
         solution=solution,
         notes=solution.notes,
     )
+
+
+def _determined(solution: Solution, K: Float, D: Float) -> tuple[Float, Float, Float]:
+    """Return K and D in gauge `lower` and J^T J of the nine parameters, less what temperature slopes take of it."""
+    nine, point = solution.plain.in_lower(K, D)
+    information = nine.information(point)
+    loss = 0.0 if solution.slopes is None else solution.slopes.loss
+    return *nine.parameters(point), information - loss
 
 
 def _first_sight(
@@ -314,10 +309,10 @@ def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
     g, noise, sensors = settings.g, _robust(solution), len(solution.sample)
     centre = solution.stated.start.box.centre
     nominal, bias, words = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
-    raw = modulus_errors(sample, nominal[..., None] * np.eye(3), bias, g)
+    raw = sample.errors(nominal[..., None] * np.eye(3), bias, g)
     sums: list[Float] = []
     parts: list[list[Float]] = []
-    for (first, e, f), (_, e_raw, _) in zip(modulus_errors(sample, K, D, g), raw, strict=True):
+    for (first, e, f), (_, e_raw, _) in zip(sample.errors(K, D, g), raw, strict=True):
         real = sample.real(first, e.shape[1])
         w = real.astype(float) if weights is None else weights[:, first : first + e.shape[1]]
         psi: Float = np.zeros((sensors, 1))

@@ -17,8 +17,8 @@ from accelcal_cli.calibration.calibrate import assessed, faults, record
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
 from accelcal_cli.calibration.observability import MISALIGNMENT, PARAMETERS, ROWS_COLUMNS
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import NO_NOISE, NORMAL_MAD
+from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
+from accelcal_cli.calibration.search import NO_NOISE
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.io.fleet import FleetReadings

@@ -505,15 +505,6 @@ class Start:
     box: Box
     sources: tuple[str, ...]
 
-    @property
-    def source(self) -> str:
-        """That of the first sensor."""
-        return self.sources[0]
-
-    def take(self, index: Int) -> Start:
-        """Return the starts of the sensors at `index`."""
-        return Start(self.box.take(index), tuple(self.sources[i] for i in index))
-
 
 def packed(sample: Sample, weights: Float | None, within: Sample | None = None) -> Triangle:
     """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
@@ -598,3 +589,10 @@ def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Floa
     mean = scale.mean(axis=-1, keepdims=True)
     turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
     return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
+
+
+def opened(sample: Sample, settings: Settings, weights: Float | None) -> tuple[Loetters, Start]:
+    """Return the cost of weighted readings in its box, and where the box comes from."""
+    triangle = packed(sample, weights)
+    start = search_box(triangle, settings)
+    return Loetters(triangle, settings.g, start.box), start

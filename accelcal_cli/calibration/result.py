@@ -160,8 +160,8 @@ class Calibration:
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, with known attitudes of one axis; NaN without freedom.
         freedom: J - 9 degrees of freedom, J - 15 with slopes with temperature, 3 J - 12 with known attitudes.
-        noise_ratio, noise_chance: s over what the scatter within the poses predicts, and the chance of so large a
-            ratio; None where nothing tells them.
+        noise_ratio, noise_chance: s over the noise expected from the scatter within the poses, and the p-value of that
+            ratio; None where the readings do not tell.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9); NaN where they have no sigma.
         information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output

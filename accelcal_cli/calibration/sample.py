@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.settings import Weights
+from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import LOOKED_AT, RAW_ROWS, Readings, may_be_doubtful
 
 if TYPE_CHECKING:
@@ -25,6 +25,16 @@ NEEDS = {
     "per pose",
 }
 """What weights need to stand beside the readings, in words."""
+
+
+HUBER = 1.345
+"""Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
+
+NORMAL_MAD = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation."""
+
+SCALE_SAMPLE = 100_000
+"""At most about this many residuals decide the scale of a robust loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,3 +186,50 @@ class Sample:
         force = self.scatter[:, part] / np.einsum("rii->ri", K)[:, None, :]
         variance: Float = np.sum((u * force) ** 2, axis=2) / self.count[:, part]
         return variance
+
+    def errors(self, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
+        """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).
+
+        K, shape (R, 3, 3), and D, shape (R, 3), are those of the sensors.
+        """
+        K_A = np.linalg.inv(K)
+        for first, block in self.blocks():
+            # Columns of contiguous memory: ten times as fast as rows of three for many poses.
+            f = K_A @ np.subtract(block.swapaxes(1, 2), D[..., None], order="C")
+            yield first, (g * g - np.einsum("rij,rij->rj", f, f)) / (2.0 * g), f.swapaxes(1, 2)
+
+    def noise(self, K: Float, D: Float, g: float) -> Float:
+        """Return a robust standard deviation of e, m/s^2, shape (R,): its median absolute value times 1.4826."""
+        poses = int(self.poses.max())
+        stride = max(1, poses // SCALE_SAMPLE)
+        sizes = [np.abs(e)[:, (-first) % stride :: stride] for first, e, _ in self.errors(K, D, g)]
+        # Nine parameters follow the smallest residuals: the factor gives the scale back what they took.
+        freedom = max(1.0, poses - 9.0) / poses
+        return np.asarray(NORMAL_MAD * np.median(np.concatenate(sizes, axis=1), axis=1) / np.sqrt(freedom))
+
+    def reweighted(
+        self, K: Float, D: Float, settings: Settings, noise: Float, weights: Float | None
+    ) -> Iterator[tuple[Float, Float | None]]:
+        """Yield the readings with the weights that a robust loss gives them, shape (R, B), block by block.
+
+        Args:
+            K, D: the sensors that residuals are of; noise: their standard deviation, m/s^2, shape (R,).
+            settings: g and the loss; weights: of the poses, shape (R, J), or None.
+        """
+        for (first, block), (_, e, _) in zip(self.blocks(), self.errors(K, D, settings.g), strict=True):
+            own: Float | float = 1.0 if weights is None else weights[:, first : first + e.shape[1]]
+            yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
+
+
+def loss_weight(z: Float, loss: Robust) -> Float:
+    """Return the weight psi(z) / z of residuals z in units of the noise, same shape."""
+    if loss == "huber":
+        return HUBER / np.maximum(np.abs(z), HUBER)
+    return 1.0 / np.sqrt(1.0 + z * z)  # soft-L1: rho = 2 (sqrt(1 + z^2) - 1)
+
+
+def loss_slope(z: Float, loss: Robust) -> Float:
+    """Return psi'(z), same shape."""
+    if loss == "huber":
+        return (np.abs(z) <= HUBER).astype(float)
+    return (1.0 + z * z) ** -1.5

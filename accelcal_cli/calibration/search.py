@@ -9,24 +9,16 @@ J - 9 [paule1982].
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.problem import Loetters, Start, compress, packed, search_box
+from accelcal_cli.calibration.problem import Loetters, Start, compress, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.settings import Robust, Settings
-from accelcal_cli.optimization.minimize import Run, minimize
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
-
-HUBER = 1.345
-"""Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
-
-NORMAL_MAD = 1.4826
-"""Standard deviation of normal noise over its median absolute deviation."""
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.optimization.minimize import Run, minimize, polish
 
 SAME_MINIMUM = 1e-6
 """Two searches ended in the same minimum when their polished costs differ by at most this part."""
@@ -41,8 +33,6 @@ digits, and no accelerometer is as quiet."""
 REWEIGHTINGS, SETTLED = 50, 1e-9
 """Robust rounds at most, about ten are the rule; and the step, in half-widths of the box, that ends them."""
 
-SCALE_SAMPLE = 100_000
-"""At most about this many residuals decide the scale of a robust loss."""
 
 SHARED_ROUNDS, SHARED_SETTLED = 10, 0.01
 """Rounds of weights and fit at most, three or four are the rule; and the relative change of m^2 that ends them."""
@@ -144,27 +134,10 @@ class Solution:
 
 def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
-    if settings.weights == "auto":
-        return _shared(sample, settings)
-    return _stated(sample, settings, sample.weights(settings.weights))
-
-
-def _stated(sample: Sample, settings: Settings, weights: Float | None) -> Stated:
-    triangle = packed(sample, weights)
-    start = search_box(triangle, settings)
-    return Stated(sample, settings, weights, Loetters(triangle, settings.g, start.box), start)
-
-
-def modulus_errors(sample: Sample, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
-    """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).
-
-    K, shape (R, 3, 3), and D, shape (R, 3), are those of the sensors.
-    """
-    K_A = np.linalg.inv(K)
-    for first, block in sample.blocks():
-        # Columns of contiguous memory: ten times as fast as rows of three for many poses.
-        f = K_A @ np.subtract(block.swapaxes(1, 2), D[..., None], order="C")
-        yield first, (g * g - np.einsum("rij,rij->rj", f, f)) / (2.0 * g), f.swapaxes(1, 2)
+    weights = None if settings.weights == "auto" else sample.weights(settings.weights)
+    cost, start = opened(sample, settings, weights)
+    stated = Stated(sample, settings, weights, cost, start)
+    return _shared(stated) if settings.weights == "auto" else stated
 
 
 def search(stated: Stated, *, closed: bool = False) -> Solution:
@@ -232,12 +205,6 @@ def rounding(cost: Loetters) -> Float:
     return np.asarray(ROUNDING * cost.triangle.poses * cost.g**4)
 
 
-def polish(cost: Loetters, x: Float) -> Run:
-    """Return Levenberg-Marquardt runs from x, shape (R, D), inside the box."""
-    solver = OPTIMIZERS.get("levenberg-marquardt")()
-    return minimize(cost, solver, runs=len(x), start=x[:, None, :], trace=False)
-
-
 def reweight(solution: Solution) -> Solution:
     """Solve again under the robust loss, if there is one: weights from the residuals, residuals from the weights."""
     settings, sample = solution.stated.settings, solution.stated.sample
@@ -245,11 +212,11 @@ def reweight(solution: Solution) -> Solution:
         return solution
     for _ in range(REWEIGHTINGS):
         K, D = solution.cost.parameters(solution.x)
-        noise = _noise_scale(sample, K, D, settings.g)
+        noise = sample.noise(K, D, settings.g)
         if (noise <= NO_NOISE * settings.g).all():  # noise-free readings: every weight is 1
             return replace(solution, noise=noise)
         triangle = solution.cost.triangle
-        blocks = _robust_blocks(solution, K, D, noise)
+        blocks = sample.reweighted(K, D, settings, noise, solution.stated.weights)
         triangle = compress(blocks, triangle.centre, triangle.scale, triangle.poses)
         before, cost = solution.x, Loetters(triangle, settings.g, solution.cost.box)
         solution = replace(solution.solved_anew(cost), noise=noise)
@@ -258,51 +225,16 @@ def reweight(solution: Solution) -> Solution:
     return solution
 
 
-def _noise_scale(sample: Sample, K: Float, D: Float, g: float) -> Float:
-    """Return a robust standard deviation of e, m/s^2, shape (R,): its median absolute value times 1.4826."""
-    poses = int(sample.poses.max())
-    stride = max(1, poses // SCALE_SAMPLE)
-    sizes = [np.abs(e)[:, (-first) % stride :: stride] for first, e, _ in modulus_errors(sample, K, D, g)]
-    # Nine parameters follow the smallest residuals: the factor gives the scale back what they took.
-    freedom = max(1.0, poses - 9.0) / poses
-    return np.asarray(NORMAL_MAD * np.median(np.concatenate(sizes, axis=1), axis=1) / np.sqrt(freedom))
-
-
-def _robust_blocks(
-    solution: Solution, K: Float, D: Float, noise: Float
-) -> Iterator[tuple[Float, Float | None]]:
-    """Yield readings with their robust weights, block by block."""
-    settings, sample, weights = solution.stated.settings, solution.stated.sample, solution.stated.weights
-    errors = modulus_errors(sample, K, D, settings.g)
-    for (first, block), (_, e, _) in zip(sample.blocks(), errors, strict=True):
-        own: Float | float = 1.0 if weights is None else weights[:, first : first + e.shape[1]]
-        yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
-
-
-def loss_weight(z: Float, loss: Robust) -> Float:
-    """Return the weight psi(z) / z of residuals z in units of the noise, same shape."""
-    if loss == "huber":
-        return HUBER / np.maximum(np.abs(z), HUBER)
-    return 1.0 / np.sqrt(1.0 + z * z)  # soft-L1: rho = 2 (sqrt(1 + z^2) - 1)
-
-
-def loss_slope(z: Float, loss: Robust) -> Float:
-    """Return psi'(z), same shape."""
-    if loss == "huber":
-        return (np.abs(z) <= HUBER).astype(float)
-    return (1.0 + z * z) ** -1.5
-
-
-def _shared(sample: Sample, settings: Settings) -> Stated:
-    """State the problem with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
-    stated = _stated(sample, settings, None)
+def _shared(stated: Stated) -> Stated:
+    """State a problem anew with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
+    sample, settings = stated.sample, stated.settings
     if sample.poses.max() <= 9 or sample.count is None or sample.scatter is None:
         return stated
     before = -1.0
     for _ in range(SHARED_ROUNDS):
         x = polish(stated.cost, np.zeros_like(stated.cost.box.centre)).x
         K, D = stated.cost.parameters(x)
-        parts = list(modulus_errors(sample, K, D, settings.g))
+        parts = list(sample.errors(K, D, settings.g))
         errors, force = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
         own = sample.explained(0, force, K)
         shared = shared_variance(errors[0], own[0], int(sample.poses[0]) - 9)
@@ -310,7 +242,9 @@ def _shared(sample: Sample, settings: Settings) -> Stated:
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
         before, weights = shared, 1.0 / (shared + own)
-        stated = _stated(sample, settings, weights / weights.mean())
+        weights = weights / weights.mean()
+        cost, start = opened(sample, settings, weights)
+        stated = Stated(sample, settings, weights, cost, start)
     return stated
 
 

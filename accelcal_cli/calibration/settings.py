@@ -1,4 +1,4 @@
-"""What a calibration is told: model, box, optimizer, robustness."""
+"""The settings of a calibration: model, box, optimizer, robustness; the YAML keys of `--config`."""
 
 from __future__ import annotations
 

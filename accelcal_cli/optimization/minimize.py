@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.optimization.optimizer import Optimizer, S, Status, take
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, S, Status, take
 from accelcal_cli.optimization.problem import Counted, Problem
 from accelcal_cli.rng import Streams
 
@@ -103,6 +103,12 @@ def minimize(
         if progress:
             progress(int(block[-1]) + 1, len(numbers))
     return parts[0] if len(parts) == 1 else _join(parts)
+
+
+def polish(problem: Problem, x: Float) -> Run:
+    """Return Levenberg-Marquardt runs from points x, shape (R, D), inside the box of a problem with residuals."""
+    solver = OPTIMIZERS.get("levenberg-marquardt")()
+    return minimize(problem, solver, runs=len(x), start=x[:, None, :], trace=False)
 
 
 class _Loop(Generic[S]):

@@ -15,19 +15,19 @@ from typing import IO, Any
 from accelcal_cli.errors import OutputError
 
 PROBE = 4096
-"""Bytes that a file system must have room for before any work is done: it gives room by blocks of this size."""
+"""Bytes that a file system must have room for before any work is done: the size of a block."""
 
 MARK, UNFINISHED = ".accelcal-", ".part"
-"""Of the name of a temporary file: short, so that any name that a file can have is one that it can be given."""
+"""Start and end of the name of a temporary file: short, so that the final name may be as long as the system allows."""
 
 MOST_LINKS = 40
-"""Symbolic links one after the other that Linux follows."""
+"""Symbolic links in a row that Linux follows."""
 
 
 def check_target(path: str) -> None:
     """Raise OutputError when `path` cannot be written, before any work is done for it.
 
-    Permissions do not tell everything (a full disk, a folder like /proc): a temporary file is made beside it and
+    Permissions do not tell everything (a full disk, a folder like /proc): a temporary file is created next to it and
     removed. A pipe or a device is left alone.
     """
     if path == "-":
@@ -75,7 +75,7 @@ def is_stream(path: str) -> bool:
 
 
 def open_stream(path: str) -> io.FileIO:
-    """Open a stream, without a buffer; what is open already goes on where it is.
+    """Open a stream, without a buffer; one that is open already continues at its position.
 
     Raises:
         OSError: it cannot be written.
@@ -85,7 +85,7 @@ def open_stream(path: str) -> io.FileIO:
 
 
 def _descriptor(path: str) -> int | None:
-    """Return the number of what a name has open in this process, as 1 for /dev/stdout and 3 for /dev/fd/3."""
+    """Return the descriptor that a name has in this process, as 1 for /dev/stdout and 3 for /dev/fd/3."""
     for _ in range(MOST_LINKS):
         folder, name = os.path.realpath(os.path.dirname(path)), os.path.basename(path)
         if folder in ("/dev/fd", f"/proc/{os.getpid()}/fd") and name.isdecimal():
@@ -97,12 +97,12 @@ def _descriptor(path: str) -> int | None:
 
 
 def _target(path: str) -> Path:
-    """Return the file that a name stands for: where it is a symbolic link, what that leads to."""
+    """Return the file that a name stands for: the target of a symbolic link."""
     return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
 
 
 def _part(target: Path) -> tuple[int, str]:
-    """Make a temporary file beside the one that is to be; return its open handle and its name."""
+    """Create a temporary file next to the final one; return its open handle and its name."""
     return tempfile.mkstemp(prefix=MARK, suffix=UNFINISHED, dir=target.parent)
 
 

@@ -1,7 +1,4 @@
-"""What a capture shows while it runs: a table that changes on a terminal, a line for each pose elsewhere.
-
-The poses of a capture, kept as they are taken.
-"""
+"""A capture while it runs: what it shows, a table that changes or one line per pose, and the file of its poses."""
 
 from __future__ import annotations
 
@@ -43,7 +40,7 @@ class Watch:
         self.live = Live(get_renderable=self._drawn, console=self.out, refresh_per_second=8) if live else None
 
     def __enter__(self) -> Watch:
-        """Begin to show."""
+        """Start to show it."""
         if self.live:
             self.live.start()
         elif not self.quiet:
@@ -73,7 +70,7 @@ class Watch:
     def _taken(self) -> str:
         """Return the line of the latest pose."""
         index, pose = self.capture.recognised()[-1], self.capture.poses[-1]
-        name = "beside the plan, kept" if index is None else describe(self.capture.planned[index])
+        name = "not in the plan, kept" if index is None else describe(self.capture.planned[index])
         spread = max(pose.spread)
         left = len(self.capture.missing())
         return f"pose {len(self.capture.poses)}: {name}; {pose.n} readings, sd {spread:.3g}; {left} to take"
@@ -88,9 +85,9 @@ class Watch:
             pointer = "> " if index == near else "  "
             style = "green" if index in numbers else "bold" if index == near else ""
             lines.append(Text(f"{pointer}{mark} {describe(direction)}", style))
-        beside = self.capture.recognised().count(None)
-        if beside:
-            lines.append(Text(f"       and {beside} beside the plan, kept"))
+        others = self.capture.recognised().count(None)
+        if others:
+            lines.append(Text(f"       and {others} not in the plan, kept"))
         return Group(*self._now(), Text(f"{len(numbers)} of {len(self.capture.planned)} taken:"), *lines)
 
     def _now(self) -> list[Text]:
@@ -114,17 +111,17 @@ HEADER = "pose,n,Nx,Ny,Nz,sx,sy,sz\n"
 class PoseFile:
     """Keeps poses under a name, one row each.
 
-    A file is replaced by a whole one with every pose, so that it holds all poses so far at any moment. A pipe or a
-    device cannot be replaced: it gets the names of the columns at once, which tells whether it takes anything, and
-    then a row with every pose. A terminal gets all of them in the end, below what is shown there.
+    A file is replaced by a whole one with every pose, so that it holds all poses so far at all times. A pipe or a
+    device cannot be replaced: it gets the header at once, which tells whether it can be written, and then a row with
+    every pose. A terminal gets all of them at the end, below what is shown there.
 
     Attributes:
-        kept: poses that are written.
-        flows: it is a pipe or a device, which has the names of the columns before there is a pose.
+        kept: number of poses that are written.
+        flows: whether it is a pipe or a device, which has the header before there is a pose.
     """
 
     def __init__(self, path: str) -> None:
-        """Open the name; OutputError when it cannot be written, before there is a pose to lose."""
+        """Open the file; raise OutputError when it cannot be written, before there is a pose to lose."""
         self.path, self.kept = path, 0
         check_target(path)
         self._stream = self._opened()
@@ -150,7 +147,7 @@ class PoseFile:
         """Keep all poses taken so far; `last` says that no more will come.
 
         Raises:
-            OutputError: they cannot be written; those that were kept before still are.
+            OutputError: they cannot be written; those that were written before still are.
         """
         if len(taken) == self.kept:
             return
@@ -189,7 +186,7 @@ class PoseFile:
             self._stream.writelines(lines)
             self._stream.flush()
         except OSError as error:
-            if self.path == "-":  # told, or left quietly, as for any command
+            if self.path == "-":  # reported, or ignored, as for any command
                 raise
             raise unwritten(self.path, error) from None
 

@@ -1,10 +1,6 @@
-"""Convergence as a picture: one panel a function, one line an optimizer, in PNG or SVG.
+"""Pictures in PNG or SVG files: convergence, a raw log with its static poses, a navigation study.
 
-Pictures in files: one style, and the same data give the same file.
-
-A raw log as a picture: the three axes, and the intervals that were taken for static poses.
-
-Pictures of a navigation study: the tracks over the map, and RMSE against time on either axis and in position.
+All have one style, and the same data give the same file.
 """
 
 from __future__ import annotations
@@ -22,6 +18,7 @@ from accelcal_cli.detection.detect import Detection
 from accelcal_cli.navigation.study import BOUND, INS
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.table import Table
+from accelcal_cli.views.blocks import Curves
 from accelcal_cli.views.navigation import Chart
 
 if TYPE_CHECKING:
@@ -32,11 +29,9 @@ if TYPE_CHECKING:
 ACROSS = 3
 """Panels side by side at most."""
 
-Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
-
 
 def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) -> None:
-    """Write the picture, whole or not at all; the same data give the same file.
+    """Write one panel per function with one line per optimizer, whole or not at all.
 
     Args:
         title: over all panels.
@@ -86,10 +81,8 @@ def _panel(
             color="0.4",
             va="bottom",
         )
-    axes.set_yscale("log")
     axes.set_title(name, fontsize=10)
-    axes.set_xlabel("evaluations")
-    axes.set_ylabel("median best cost")
+    axes.set(yscale="log", xlabel="evaluations", ylabel="median best cost")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
     axes.ticklabel_format(axis="x", style="plain")
     axes.locator_params(axis="x", integer=True)
@@ -137,31 +130,30 @@ MOST_NUMBERS = 110
 """An interval carries its number when it is at least as wide as this many side by side."""
 
 
-def plot_log(found: Detection, path: str) -> None:
-    """Write the picture, whole or not at all; the same log gives the same file.
+def plot_log(detection: Detection, path: str) -> None:
+    """Write the three axes of a log and the intervals taken for static poses, whole or not at all.
 
     Args:
-        found: a detection with its envelope.
+        detection: with its envelope.
         path: ends in .png or .svg.
     """
     with picture(path, 12.0, 4.8) as figure:
         axes = figure.subplots()
-        edges = _spans(found)
-        _log(axes, found)
+        edges = _spans(detection)
+        _log(axes, detection)
         _shade(axes, edges)
         axes.set_title(
-            f"{Path(found.source).name}: {len(edges)} static poses, multiplier {found.multiplier:g}",
+            f"{Path(detection.source).name}: {len(edges)} static poses, multiplier {detection.multiplier:g}",
             fontsize=11,
             pad=14,
         )
-        axes.set_xlabel("row" if found.intervals.time is None else "time")
-        axes.set_ylabel("output, sensor units")
+        axes.set(xlabel="row" if detection.intervals.time is None else "time", ylabel="output, sensor units")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
-def _spans(found: Detection) -> Float:
+def _spans(detection: Detection) -> Float:
     """Return first and last abscissa of each interval, shape (I, 2)."""
-    poses = found.intervals
+    poses = detection.intervals
     return np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
 
 
@@ -176,13 +168,13 @@ def _shade(axes: Axes, edges: Float) -> None:
             axes.annotate(str(k + 1), place, xycoords=at, ha="center", va="bottom", fontsize=6)
 
 
-def _log(axes: Axes, found: Detection) -> None:
+def _log(axes: Axes, detection: Detection) -> None:
     """Draw each axis as the band between its least and greatest value in each bin."""
-    if found.envelope is None:
+    if detection.envelope is None:
         return
-    at, low, high = found.envelope.bins()
+    at, low, high = detection.envelope.bins()
     for k, axis in enumerate("xyz"):
-        name = found.columns[k]
+        name = detection.columns[k]
         label = axis if name.isdigit() else name
         axes.fill_between(
             at, low[:, k], high[:, k], step="post", color=COLOURS[k], alpha=0.9, linewidth=0.6, label=label

@@ -18,30 +18,30 @@ class Plan:
     """The next poses.
 
     Attributes:
-        poses: how many have been taken.
+        poses: number of poses so far.
         directions: unit specific force of the next, best first, shape (k, 3).
-        seen: what the poses determine before the first of them and after each, k + 1 entries.
+        stages: what the poses determine before the first of them and after each, k + 1 entries.
         noise: standard deviation of one pose in parts of g; None when not known.
-        so_far: the calibration of the poses that have been taken; None when there are none.
+        so_far: the calibration of the poses so far; None when there are none.
     """
 
     poses: int
     directions: Float
-    seen: tuple[Observability, ...]
+    stages: tuple[Observability, ...]
     noise: float | None
     so_far: Calibration | None = None
 
     @property
     def verdict(self) -> str:
         """What the verdict will be after the last pose."""
-        return "undetermined" if self.beyond_poses else self.seen[-1].verdict
+        return "undetermined" if self.beyond_poses else self.stages[-1].verdict
 
     @property
     def beyond_poses(self) -> bool:
-        """Whether the calibration so far is undetermined for another reason than its poses: more do not mend it."""
+        """Whether the calibration so far is undetermined for a reason that more poses do not change."""
         if self.so_far is None or self.so_far.verdict != "undetermined":
             return False
-        return self.seen[0].verdict != "undetermined"
+        return self.stages[0].verdict != "undetermined"
 
 
 def plan(
@@ -56,9 +56,9 @@ def plan(
 
     Args:
         information: J^T J of the poses so far, shape (9, 9); zeros when there are none.
-        poses: how many they are.
-        count: how many to add.
-        fixture: one of planner.FIXTURES.
+        poses: their number.
+        count: number of poses to add.
+        fixture: one of design.FIXTURES.
         noise: standard deviation of one pose in parts of g; None when not known.
         so_far: the calibration of the poses so far, whose verdict the plan carries on.
     """
@@ -67,5 +67,5 @@ def plan(
     directions = allowed[best_poses(quality.knowing(information, held), allowed, count)]
     rows = design(directions)
     sums = [information + rows[:k].T @ rows[:k] for k in range(count + 1)]
-    seen = tuple(Observability.of(total, poses + k, held) for k, total in enumerate(sums))
-    return Plan(poses, directions, seen, noise, so_far)
+    stages = tuple(Observability.of(total, poses + k, held) for k, total in enumerate(sums))
+    return Plan(poses, directions, stages, noise, so_far)

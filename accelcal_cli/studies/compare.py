@@ -15,8 +15,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.problem import Loetters, pack, unpack
-from accelcal_cli.calibration.search import polish
-from accelcal_cli.optimization.minimize import Run, Stopping, minimize
+from accelcal_cli.optimization.minimize import Run, Stopping, minimize, polish
 from accelcal_cli.sensor.model import to_gauge
 from accelcal_cli.studies.scenarios import (
     ERRORS,

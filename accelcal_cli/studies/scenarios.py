@@ -25,10 +25,10 @@ from accelcal_cli.calibration.problem import (
     packed,
 )
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import polish
 from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.sensor.model import ARCSEC, MICRO_G, PPM, ErrorModel, to_gauge, triangular
 from accelcal_cli.sensor.poses import directions

@@ -36,9 +36,9 @@ from accelcal_cli.calibration.observability import (
 from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import modulus_errors, polish
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
@@ -459,8 +459,8 @@ def _few_off(old: Calibration, readings: Readings) -> list[int]:
 
 
 def _errors(readings: Readings, model: ErrorModel, g: float) -> Iterator[tuple[int, Float, Float]]:
-    """Yield (first pose, e, f) of one sensor block by block, shapes (B,) and (B, 3); see `modulus_errors`."""
-    for first, e, f in modulus_errors(Sample.of([readings]), model.K[None], model.D[None], g):
+    """Yield (first pose, e, f) of one sensor block by block, shapes (B,) and (B, 3); see `Sample.errors`."""
+    for first, e, f in Sample.of([readings]).errors(model.K[None], model.D[None], g):
         yield first, e[0], f[0]
 
 

@@ -25,15 +25,13 @@ UNKNOWN, ASSUMED = "not determined", "taken as 0"
 
 def tables(result: Calibration) -> list[Table]:
     """Return every table of a result, in reading order."""
-    warmth = [] if result.temperature is None else [temperature(result, result.temperature)]
-    return [
-        parameters(result),
-        engineering(result),
-        *warmth,
-        fit(result),
-        observability(result),
-        worst_poses(result),
-    ]
+    return [*parameter_tables(result), fit(result), observability(result), worst_poses(result)]
+
+
+def parameter_tables(result: Calibration) -> list[Table]:
+    """Return the parameters in the paper's units, in an engineer's, and against temperature where it matters."""
+    slopes = [] if result.temperature is None else [temperature(result, result.temperature)]
+    return [parameters(result), engineering(result), *slopes]
 
 
 def blocks(result: Calibration) -> list[Block]:
@@ -84,7 +82,7 @@ def _undetermined(result: Calibration) -> NDArray[np.bool_]:
 
 
 def _pair(value: float, sigma: float, *, lost: bool) -> list[object]:
-    """Return a value and its sigma; a value that the poses do not determine is not shown as one."""
+    """Return a value and its sigma, or that the poses do not determine it."""
     if lost:
         return [UNKNOWN, None]
     return [value, sigma if np.isfinite(sigma) else None]
@@ -102,17 +100,17 @@ def engineering(result: Calibration) -> Table:
     bias = units.bias_force(K, result.D_a - result.nominal_bias) / per_g
     values = np.concatenate([units.scale_error(K, result.nominal_scale), angles, bias])
     sigma = np.sqrt(np.diagonal(result.covariance)) / per_g
-    shown = (
+    kinds = (
         ("scale factor error", "ppm", units.PPM, "%", 100.0),
         ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
         ("bias", "micro-g", units.MICRO_G, "m/s^2", metres * per_g),
     )
     rows = []
     for p, name in enumerate(PARAMETERS):
-        kind, unit, factor, second, second_factor = shown[p // 3]
+        kind, unit, factor, second, second_factor = kinds[p // 3]
         pair = [ASSUMED, None] if result.held[p] else _pair(values[p], sigma[p], lost=bool(result.lost[p]))
-        first, again = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
-        rows.append((f"{kind} {name.split()[-1]}", *first, unit, *again, second))
+        first, other = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
+        rows.append((f"{kind} {name.split()[-1]}", *first, unit, *other, second))
     columns = (
         Column("parameter"),
         Column("value", format=",.6g"),
@@ -165,7 +163,7 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
         Column("unit"),
     )
     note = (
-        f"The other parameters hold at {slopes.reference:.4g} degrees; the poses went from {slopes.low:.4g} to "
+        f"The other parameters hold at {slopes.reference:.4g} degrees; the poses range from {slopes.low:.4g} to "
         f"{slopes.high:.4g}."
     )
     return Table("Temperature", columns, tuple(rows), (note,))
@@ -201,11 +199,9 @@ def observability(result: Calibration) -> Table:
     """Return the dilution of precision of each parameter."""
     rows: list[tuple[object, ...]] = []
     for (name, dop), held in zip(result.dop.parameters.items(), result.held, strict=True):
-        if held:
-            rows.append((name, "-", ASSUMED))
-            continue
         word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
-        rows.append((name, dop if np.isfinite(dop) else "infinite", word))
+        size = dop if np.isfinite(dop) else "infinite"
+        rows.append((name, "-", ASSUMED) if held else (name, size, word))
     notes = (
         "Dilution of precision: parameter error divided by the noise of one pose "
         f"(as {result.unit} at 1 g). Above {WEAK:g} weak, above {UNDETERMINED:g} undetermined.",
@@ -242,7 +238,7 @@ def worst_poses(result: Calibration) -> Table:
 
 
 def values(result: Calibration) -> Table:
-    """Return the parameters one a row, for CSV; one that is not determined has no value."""
+    """Return one row per parameter, for CSV; one that is not determined has no value."""
     lost = _undetermined(result)
     names = [f"K_{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)] + ["D_1", "D_2", "D_3"]
     entries = (
@@ -286,7 +282,7 @@ def pose_residuals(result: Calibration) -> Table:
 
 
 def accuracy(result: Calibration) -> str:
-    """Say in one sentence how well the parameters are known; nothing where the poses do not tell."""
+    """Say in one sentence how well the parameters are known; an empty text where the poses do not tell."""
     variance = np.diagonal(result.covariance)
     if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(variance).all():
         return ""

@@ -1,4 +1,4 @@
-"""A fleet as tables: one row a sensor for programs, a summary for people."""
+"""A fleet as tables: one row per sensor for programs, a summary for people."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ SHOWN = 10
 WORST = 5
 """Sensors with the largest rms that the summary names."""
 
+ADVICE = " Add these poses:"
+"""Where the advice behind a reason begins, for which the summary has no room."""
+
 CLAUSE = re.compile(r"[:.] ")
 """Where the first clause of a caution ends."""
 
@@ -26,8 +29,8 @@ QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 VERDICTS = ("good", "weak", "undetermined", FAILED)
 
 
-def sensors(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout]) -> Table:
-    """Return one row a sensor: verdict, parameters with sigma, dilution of precision, fit, and what is wrong."""
+def sensors(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout]) -> Table:
+    """Return one row per sensor: verdict, parameters with sigma, dilution of precision, fit, and what is wrong."""
     entries = [(i, j) for i in range(3) for j in range(3)]
     numbers: list[tuple[str, Float]] = [
         *((f"K_{i + 1}{j + 1}", fleet.K_a[:, i, j]) for i, j in entries),
@@ -40,9 +43,9 @@ def sensors(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout]) -> T
         ("s", fleet.s),
         ("cost", fleet.cost),
     ]
-    apart = np.full(len(labels), "", dtype=object)
-    for one in found:
-        apart[one.at] += ("; " if apart[one.at] else "") + one.quantity.name
+    names = np.full(len(labels), "", dtype=object)
+    for one in standouts:
+        names[one.at] += ("; " if names[one.at] else "") + one.quantity.name
     columns = (
         Column("sensor"),
         Column("verdict"),
@@ -56,7 +59,7 @@ def sensors(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout]) -> T
     lists = (
         [labels, fleet.verdict.tolist(), fleet.poses.tolist()]
         + [values.tolist() for _, values in numbers]
-        + [fleet.outlying.tolist(), apart.tolist(), fleet.reason.tolist(), fleet.caution.tolist()]
+        + [fleet.outlying.tolist(), names.tolist(), fleet.reason.tolist(), fleet.caution.tolist()]
     )
     return Table("Sensors", columns, tuple(zip(*lists, strict=True)))
 
@@ -66,16 +69,16 @@ def counts(fleet: Fleet) -> str:
     each = {word: int((fleet.verdict == word).sum()) for word in VERDICTS}
     listed = ", ".join(f"{n:,} {word}" for word, n in each.items() if n)
     warned = int((fleet.caution != "").sum())
-    beside = f", {warned:,} of them with a caution" if warned else ""
-    return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{beside}"
+    warnings = f", {warned:,} of them with a caution" if warned else ""
+    return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{warnings}"
 
 
-def blocks(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: float) -> list[Block]:
+def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Block]:
     """Return what a fleet shows: how many sensors of each verdict, then what is worth knowing."""
-    return [Paragraph(heading=counts(fleet)), BLANK, *summary(fleet, labels, found, g)]
+    return [Paragraph(heading=counts(fleet)), BLANK, *summary(fleet, labels, standouts, g)]
 
 
-def summary(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: float) -> list[Table]:
+def summary(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Table]:
     """Return what a person wants to know of a fleet, in reading order."""
     tables = []
     if fleet.determined.any():
@@ -83,8 +86,8 @@ def summary(fleet: Fleet, labels: Sequence[str], found: Sequence[Standout], g: f
     warned = np.flatnonzero(fleet.caution != "")
     if len(warned):
         tables.append(_warned(fleet, labels, warned, g))
-    if found:
-        tables.append(_apart(labels, found))
+    if standouts:
+        tables.append(_standing_out(labels, standouts))
     bad = np.flatnonzero(fleet.verdict != "good")
     if len(bad):
         tables.append(_not_good(fleet, labels, bad))
@@ -146,10 +149,10 @@ def _worst(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
 def _more(outlying: int) -> tuple[str, ...]:
     if not outlying:
         return ()
-    return (f"Sensors with poses beyond chance: {outlying:,} (column outlying_poses of --format csv).",)
+    return (f"Sensors with outliers: {outlying:,} (column outlying_poses of --format csv).",)
 
 
-def _apart(labels: Sequence[str], found: Sequence[Standout]) -> Table:
+def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table:
     """Return the sensors that stand out from the fleet."""
     rows = tuple(
         (
@@ -160,7 +163,7 @@ def _apart(labels: Sequence[str], found: Sequence[Standout]) -> Table:
             one.quantity.unit,
             one.z,
         )
-        for one in found[:SHOWN]
+        for one in standouts[:SHOWN]
     )
     columns = (
         Column("sensor"),
@@ -173,8 +176,8 @@ def _apart(labels: Sequence[str], found: Sequence[Standout]) -> Table:
     notes = [
         "z: distance from the median in standard deviations of the fleet, by its median absolute deviation."
     ]
-    if len(found) > SHOWN:
-        notes.append(f"And {len(found) - SHOWN:,} more (column stands_out of --format csv).")
+    if len(standouts) > SHOWN:
+        notes.append(f"And {len(standouts) - SHOWN:,} more (column stands_out of --format csv).")
     return Table("Stand out from the fleet", columns, rows, tuple(notes))
 
 
@@ -185,7 +188,7 @@ def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table
         (labels[r], 100.0 * float(fleet.s[r]) / g, fleet.outlying[r], CLAUSE.split(fleet.caution[r])[0])
         for r in order
     )
-    notes = ["s: standard deviation of a pose. Whole sentences: column caution of --format csv."]
+    notes = ["s: standard deviation of one pose. Full sentences: column caution of --format csv."]
     if len(warned) > SHOWN:
         notes.append(f"And {len(warned) - SHOWN:,} more.")
     columns = (
@@ -200,6 +203,6 @@ def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table
 def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
     """Return the sensors whose verdict is not good, the worst verdict first."""
     order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
-    rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r]) for r in order[:SHOWN])
+    rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r].partition(ADVICE)[0]) for r in order[:SHOWN])
     notes = (f"And {len(bad) - SHOWN:,} more.",) if len(bad) > SHOWN else ()
     return Table("Not good", (Column("sensor"), Column("verdict"), Column("why")), rows, notes)

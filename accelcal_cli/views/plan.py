@@ -23,7 +23,7 @@ SO_FAR = ("verdict", "reasons", "cautions")
 
 def pose_table(plan: Plan) -> Table:
     """Return one row per pose: how to hold the sensor, and the worst of each kind expected after it."""
-    rows = [_pose_row(plan, k) for k in range(len(plan.seen))]
+    rows = [_pose_row(plan, k) for k in range(len(plan.stages))]
     columns = [Column("pose", format="d"), Column("hold")]
     columns += [Column(axis, format=".3f") for axis in "xyz"]
     columns += [Column(f"DOP {SHORT[kind]}", format=".3f", key=f"dop_{kind}") for kind, *_ in KINDS]
@@ -37,11 +37,11 @@ def pose_table(plan: Plan) -> Table:
 
 
 def _pose_row(plan: Plan, k: int) -> tuple[object, ...]:
-    seen = plan.seen[k]
+    stage = plan.stages[k]
     direction = plan.directions[k - 1] if k else None
     hold = "so far" if direction is None else describe(direction)
     vector = (None, None, None) if direction is None else tuple((direction + 0.0).tolist())
-    worst = [_finite(float(seen.dop[kind].max())) for _, kind, _, _ in KINDS]
+    worst = [_finite(float(stage.dop[kind].max())) for _, kind, _, _ in KINDS]
     sigma = [_times(dop, plan.noise, size) for dop, (*_, size) in zip(worst, KINDS, strict=True)]
     return (plan.poses + k, hold, *vector, *worst, *sigma)
 
@@ -51,7 +51,7 @@ def parameter_table(plan: Plan) -> Table:
     rows = []
     for _, kind, unit, size in KINDS:
         for p in range(kind.start, kind.stop):
-            before, after = (_finite(float(seen.dop[p])) for seen in (plan.seen[0], plan.seen[-1]))
+            before, after = (_finite(float(stage.dop[p])) for stage in (plan.stages[0], plan.stages[-1]))
             sigma = (_times(before, plan.noise, size), _times(after, plan.noise, size))
             rows.append((PARAMETERS[p], before, after, *sigma, unit if plan.noise is not None else None))
     columns = (
@@ -93,12 +93,12 @@ def blocks(plan: Plan) -> list[Block]:
 def _notes(plan: Plan) -> tuple[str, ...]:
     if plan.beyond_poses:
         return (
-            "More poses do not mend the verdict on those so far; the plan only tells what they would add.",
+            "More poses do not change the verdict on those so far; the plan only shows what they would add.",
         )
     if plan.verdict != "undetermined":
         aligned = plan.so_far is not None and plan.so_far.held.any()
         return (ALIGNED_NOTE,) if aligned else ()
-    lost = plan.seen[-1].above(UNDETERMINED)
+    lost = plan.stages[-1].above(UNDETERMINED)
     named = ", ".join(lost) if 0 < len(lost) < len(PARAMETERS) else "all nine parameters"
     return (f"Still not determined after these poses: {named}. Plan more poses, or another fixture.",)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from accelcal_cli.calibration.observability import MISALIGNMENT, PARAMETERS, SCALE
+from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.sensor import model as units
 from accelcal_cli.table import Column, Table
 from accelcal_cli.verification.verify import Difference, Verification
 from accelcal_cli.views.blocks import BLANK, Block, Conclusion
 
-MICRO_RAD = 1000.0 * units.MRAD
+UNITS = ((-units.PPM, "ppm"), (-1000.0 * units.MRAD, "micro-rad"), (units.MICRO_G, "micro-g"))
+"""Of scale factors, misalignments and biases; those of the inverse matrix change sign, so that they are of K_a."""
 
 
 def blocks(result: Verification) -> list[Block]:
@@ -25,28 +26,23 @@ def differences(result: Verification) -> Table:
         Column("new - old", format=",.1f", key="difference"),
         Column("sigma", format=",.1f"),
         Column("unit"),
-        Column("chance", format=".2g"),
+        Column("p-value", format=".2g", key="chance"),
         Column("adjusted", format=".2g"),
         Column("", key="changed"),
     )
     note = (
-        "Chance: of a difference as large when nothing changed; adjusted: the same with nine looks taken into "
-        "account (Holm)."
+        "p-value: probability of a difference as large or larger if nothing changed; adjusted: the same, corrected for "
+        "nine comparisons (Holm)."
     )
     return Table("Differences", columns, rows, (note,))
 
 
 def _row(d: Difference, result: Verification) -> tuple[object, ...]:
-    """Return one parameter; those of the inverse matrix change sign, so that they are of K_a."""
-    if d.name in PARAMETERS[SCALE]:
-        factor, unit = -units.PPM / result.g, "ppm"
-    elif d.name in PARAMETERS[MISALIGNMENT]:
-        factor, unit = -MICRO_RAD / result.g, "micro-rad"
-    else:
-        factor, unit = units.MICRO_G / result.g, "micro-g"
+    """Return one parameter."""
+    size, unit = UNITS[PARAMETERS.index(d.name) // 3]
     if d.value != d.value:
         return (d.name, None, None, unit, None, None, "not determined")
-    changed = "changed" if d.changed else ""
+    factor, changed = size / result.g, "changed" if d.changed else ""
     return (d.name, d.value * factor + 0.0, d.sigma * abs(factor), unit, d.chance, d.adjusted, changed)
 
 
@@ -54,10 +50,10 @@ def evidence(result: Verification) -> Table:
     """Return what the verdict rests on."""
     unit = result.unit
     rows: list[tuple[object, ...]] = [
-        ("chance that an unchanged sensor looks so", f"{result.chance:.3g}", ""),
+        ("p-value, all tests together", f"{result.chance:.3g}", ""),
         ("level", f"{result.level:g}", ""),
         (f"chi-square of {result.directions} directions", f"{result.chi_square:.4g}", ""),
-        ("its chance", f"{result.chance_together:.3g}", ""),
+        ("p-value of that chi-square", f"{result.chance_together:.3g}", ""),
         ("noise of one pose, old", f"{result.s_old:.6g}", unit),
         ("noise of one pose, new", f"{result.s_new:.6g}" if result.freedom > 0 else "-", unit),
         ("rms of |f| - g under the old result", f"{result.rms:.6g}", unit),
@@ -65,7 +61,7 @@ def evidence(result: Verification) -> Table:
         ("local gravity g", f"{result.g:.7g}", unit),
     ]
     if result.freedom > 0:
-        rows.insert(6, ("chance of so different a noise", f"{result.noise_chance:.2g}", ""))
+        rows.insert(6, ("p-value of the difference in noise", f"{result.noise_chance:.2g}", ""))
     if result.tolerance is not None:
         rows.insert(-2, ("tolerance", f"{result.tolerance:g}", unit))
     return Table("Tests", (Column("quantity"), Column("value"), Column("unit")), tuple(rows))

@@ -190,7 +190,7 @@ def test_the_noise_of_forty_clean_sets_is_not_told_of():
 
 @pytest.mark.parametrize(
     ("ratio", "chance", "told"),
-    [(1.9, 1e-9, False), (2.1, 1e-9, True), (5.0, 2e-3, False), (5.0, 5e-4, True), (None, None, False)],
+    [(1.9, 1e-9, False), (2.1, 1e-9, True), (5.0, 2e-3, False), (5.0, 5e-4, True), (np.nan, np.nan, False)],
 )
 def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio, chance, told):
     said = cautions.more_than_noise(ratio, chance)

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from simulated import DPSO, MEMS, dpso_box, loetters, rotation
 
 from accelcal_cli.calibration import observability as quality
-from accelcal_cli.calibration.assess import poorly_determined
 from accelcal_cli.calibration.fit import firm
 from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, propagate
 from accelcal_cli.calibration.problem import Box, pack
@@ -146,8 +145,8 @@ def test_a_missing_rank_is_undetermined_and_named():
     assert seen.above(25.0) == ["bias y"]
     assert np.isinf(seen.dop[7])
     assert np.isfinite(np.delete(seen.dop, 7)).all()
-    assert poorly_determined(seen, ()) == ("The poses do not determine: bias y.",)
-    assert poorly_determined(seen, ("+x up", "-y up"))[-1] == "Add these poses: +x up; -y up."
+    assert seen.in_words("The poses", ()) == ("The poses do not determine: bias y.",)
+    assert seen.in_words("The poses", ("+x up", "-y up"))[-1] == "Add these poses: +x up; -y up."
 
 
 def test_a_combination_that_is_missing_makes_its_parts_undetermined():
@@ -162,11 +161,11 @@ def test_a_combination_that_is_missing_makes_its_parts_undetermined():
 def test_words_for_a_weak_set():
     information = np.eye(9)
     information[4, 4], information[8, 8] = 1 / 12**2, 1 / 30**2
-    lines = poorly_determined(Observability.of(information, 20), ("+z up",))
+    lines = Observability.of(information, 20).in_words("The poses", ("+z up",))
     assert lines[0] == "The poses do not determine: bias z."
     assert lines[1] == "Weakly determined: misalignment xz."
     assert "+z up" in lines[2]
-    assert poorly_determined(Observability.of(np.eye(9), 20), ()) == ()
+    assert Observability.of(np.eye(9), 20).in_words("The poses", ()) == ()
 
 
 @pytest.mark.parametrize(

@@ -71,10 +71,10 @@ def test_the_record_goes_round():
     assert again.record() == result.record()
     np.testing.assert_array_equal(again.temperature.bias, result.temperature.bias)
     record["temperature"]["scale"] = [1, 2]
-    with pytest.raises(DataError, match="temperature: expected 3 numbers"):
+    with pytest.raises(DataError, match="temperature: scale: expected 3 numbers"):
         Calibration.from_record(record, "r")
     del record["temperature"]["scale"]
-    with pytest.raises(DataError, match="temperature: 'scale' is missing"):
+    with pytest.raises(DataError, match="temperature: missing: scale"):
         Calibration.from_record(record, "r")
 
 

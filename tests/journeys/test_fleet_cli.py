@@ -241,7 +241,7 @@ def test_an_interrupt_leaves_nothing_behind(run, table, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("accelcal_cli.output.console.write_result", stop)
+    monkeypatch.setattr("accelcal_cli.output.machine.write_result", stop)
     done = run("fleet", table, "-o", "results/")
     assert (done.code, done.out, done.err) == (130, "", "accelcal: interrupted\n")
     assert sorted(os.listdir(".")) == before

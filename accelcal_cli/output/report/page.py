@@ -12,7 +12,6 @@ from accelcal_cli.errors import UsageError
 from accelcal_cli.output.report import pictures
 from accelcal_cli.table import Table
 from accelcal_cli.views import calibration as tables
-from accelcal_cli.views.calibration import accuracy, headline, pose_residuals
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -42,12 +41,12 @@ def page(result: Calibration, title: str) -> str:
         .render(
             result=result,
             title=title,
-            accuracy=accuracy(result),
-            headline=headline(result),
-            parameters=_parameters(result),
+            accuracy=tables.accuracy(result),
+            headline=tables.headline(result),
+            parameters=tables.parameter_tables(result),
             fit=tables.fit(result),
             worst=tables.worst_poses(result).filled(),
-            poses=pose_residuals(result),
+            poses=tables.pose_residuals(result),
             observability=tables.observability(result),
             pictures=_pictures(result),
             settings=dump(result.record()["settings"]),
@@ -62,12 +61,6 @@ def typeset(text: str) -> str:
     for plain, raised in RAISED:
         text = text.replace(plain, raised)
     return text
-
-
-def _parameters(result: Calibration) -> list[Table]:
-    slopes = result.temperature
-    warmth = [] if slopes is None else [tables.temperature(result, slopes)]
-    return [tables.parameters(result), tables.engineering(result), *warmth]
 
 
 def _environment() -> Environment:
@@ -92,15 +85,7 @@ def _numeric(table: Table) -> list[bool]:
 def _pictures(result: Calibration) -> dict[str, Any]:
     from markupsafe import Markup
 
-    return {
-        name: Markup(draw(result))
-        for name, draw in (
-            ("residuals", pictures.residuals),
-            ("sphere", pictures.sphere),
-            ("convergence", pictures.convergence),
-            ("dilution", pictures.dilution),
-        )
-    }
+    return {name: Markup(draw(result)) for name, draw in pictures.PICTURES.items()}
 
 
 def _origin(result: Calibration) -> list[tuple[str, str]]:

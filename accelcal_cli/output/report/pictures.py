@@ -1,11 +1,7 @@
-"""The charts of a report: residuals, convergence, dilution of precision.
+"""The pictures of a report: residuals, poses on the sphere, convergence, dilution of precision.
 
-The poses of a calibration on the sphere, as a picture of a report.
-
-The frame that the pictures of a report share: inline SVG, no font, no file, no background of their own.
-
-Colours are written as marks and replaced by `currentColor` and CSS variables of the page, so that one picture
-serves a light and a dark page, and paper.
+Each is inline SVG without a font, a file or a background of its own. Colours are written as marks and replaced by
+`currentColor` and CSS variables of the page, so that one picture serves a light page, a dark page and paper.
 """
 
 from __future__ import annotations
@@ -36,22 +32,20 @@ def residuals(result: Calibration) -> str:
         ("before calibration", BEFORE, np.array([p.residual_before for p in result.poses_fit])),
         ("after calibration", AFTER, np.array([p.residual for p in result.poses_fit])),
     )
-    with canvas(3.4) as (figure, drawn):
+    with canvas(3.4) as (figure, svg):
         for axes, (title, colour, y) in zip(figure.subplots(2, 1, sharex=True), panels, strict=True):
             axes.vlines(x, 0.0, y, color=colour, linewidth=1.0)
             axes.plot(x[~named], y[~named], "o", color=colour, markersize=3.2)
             axes.plot(x[named], y[named], "X", color=BAD, markersize=7)
             axes.axhline(0.0, color=INK, linewidth=0.8)
-            axes.set_title(title)
-            axes.set_ylabel(f"|f| - g [{result.unit}]")
+            axes.set(title=title, ylabel=f"|f| - g [{result.unit}]")
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.set_xlim(x.min() - 0.7, x.max() + 0.7)
+        axes.set(xlim=(x.min() - 0.7, x.max() + 0.7), xlabel="pose")
         _whole_numbers(axes)
-        axes.set_xlabel("pose")
     largest = [np.abs(y).max(initial=0.0) for *_, y in panels]
     outliers = f"; outliers (with a cross): {named.sum()}" if named.any() else ""
     return inline(
-        drawn,
+        svg,
         "residuals",
         f"Residuals of {len(x)} poses: at most {largest[0]:.3g} {result.unit} before calibration, "
         f"{largest[1]:.3g} {result.unit} after it{outliers}.",
@@ -63,19 +57,17 @@ def convergence(result: Calibration) -> str:
     points = [(n, cost) for n, cost in result.convergence if cost > 0]
     if len(points) < 2:
         return ""
-    with canvas(2.6) as (figure, drawn):
+    with canvas(2.6) as (figure, svg):
         axes = figure.subplots()
         axes.step(*zip(*points, strict=True), where="post", color=AFTER)
         if result.cost > 0 and result.settings.get("polish", True):
             axes.axhline(result.cost, color=BEFORE, linestyle="--", linewidth=1.0, label="after the polish")
             axes.legend(frameon=False, loc="upper right")
-        axes.set_yscale("log")
-        axes.set_xlabel("evaluations")
-        axes.set_ylabel(f"best cost L [({result.unit})^4]")
+        axes.set(yscale="log", xlabel="evaluations", ylabel=f"best cost L [({result.unit})^4]")
         axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
     first, last = points[0], points[-1]
     return inline(
-        drawn,
+        svg,
         "convergence",
         f"Best cost of {result.optimizer} against evaluations: from {first[1]:.3g} after {first[0]:,} to {last[1]:.3g} "
         f"after {last[0]:,}.",
@@ -90,7 +82,7 @@ def dilution(result: Calibration) -> str:
     end = 1.3 * max(UNDETERMINED, dop[known].max(initial=0.0))
     start = min(0.1, 0.5 * dop[known].min(initial=1.0))
     colours = [BAD if d > UNDETERMINED else DOUBT if d > WEAK else AFTER for d in dop]
-    with canvas(3.0) as (figure, drawn):
+    with canvas(3.0) as (figure, svg):
         axes = figure.subplots()
         axes.barh(names, np.where(known, dop, end) - start, left=start, color=colours, height=0.62)
         for row, value in enumerate(dop):
@@ -107,7 +99,7 @@ def dilution(result: Calibration) -> str:
     worst = "infinite" if not known.all() else f"{dop.max():.3g}"
     words = [f"{n} {d:.3g}" if np.isfinite(d) else f"{n} infinite" for n, d in zip(names, dop, strict=True)]
     return inline(
-        drawn,
+        svg,
         "dilution",
         f"Dilution of precision, the worst {worst}: {', '.join(words)}. Above {WEAK:g} weak, above {UNDETERMINED:g} "
         "undetermined.",
@@ -115,8 +107,7 @@ def dilution(result: Calibration) -> str:
 
 
 def _log_bars(axes: Axes, start: float, end: float) -> None:
-    axes.set_xscale("log")
-    axes.set_xlim(start, end)
+    axes.set(xscale="log", xlim=(start, end))
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -140,14 +131,14 @@ NEAR_RIM = 0.7
 def sphere(result: Calibration) -> str:
     """Return the poses on two hemispheres in an equal-area projection: +z up and -z up."""
     u = np.array([p.direction for p in result.poses_fit]).reshape(-1, 3)
-    with canvas(2.9) as (figure, drawn):
+    with canvas(2.9) as (figure, svg):
         for axes, sign in zip(figure.subplots(1, 2), (1.0, -1.0), strict=True):
             _hemisphere(axes, sign)
             here = [i for i in range(len(u)) if u[i, 2] * sign >= 0]
             _points(axes, u[here], sign, [result.poses_fit[i] for i in here], set(result.outliers), len(u))
     upper = int((u[:, 2] >= 0).sum())
     return inline(
-        drawn,
+        svg,
         "sphere",
         f"Attitudes of {len(u)} poses on the sphere, as the direction that points up in the sensor's axes: {upper} "
         f"with +z up or level, {len(u) - upper} with -z up.",
@@ -170,9 +161,7 @@ def _hemisphere(axes: Axes, sign: float) -> None:
         axes.plot([0, x], [0, y], color=FAINT, linewidth=0.6)
         axes.text(1.14 * x, 1.14 * y, name, ha="center", va="center")
     axes.set_title("+z up" if sign > 0 else "-z up", loc="center", pad=10)
-    axes.set_xlim(-1.25, 1.25)
-    axes.set_ylim(-1.25, 1.25)
-    axes.set_aspect("equal")
+    axes.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25), aspect="equal")
     axes.set_axis_off()
 
 
@@ -190,14 +179,14 @@ def _points(axes: Axes, u: Float, sign: float, poses: list[PoseFit], outliers: s
     for (x, y), pose in zip(place.round(1), poses, strict=True):
         at.setdefault((x, y), []).append(str(pose.pose + 1))
     for (x, y), numbers in at.items():
-        beside: dict[str, Any] = {"xytext": (4, 4)}
+        placing: dict[str, Any] = {"xytext": (4, 4)}
         if x * x + y * y > NEAR_RIM:  # inwards, where the names of the axes are not
-            beside = {
+            placing = {
                 "xytext": (-6 * x, -6 * y),
                 "ha": _side(x, "left", "right"),
                 "va": _side(y, "bottom", "top"),
             }
-        axes.annotate(", ".join(numbers), (x, y), textcoords="offset points", fontsize=7, **beside)
+        axes.annotate(", ".join(numbers), (x, y), textcoords="offset points", fontsize=7, **placing)
 
 
 def _side(value: float, low: str, high: str) -> str:
@@ -235,30 +224,23 @@ STYLE = {
 }
 
 
-class Drawn:
-    """The SVG text of a figure, once it is drawn."""
-
-    text = ""
-
-
 @contextmanager
-def canvas(height: float) -> Iterator[tuple[Figure, Drawn]]:
-    """Open a figure of the page's style; its SVG is there when it is left."""
+def canvas(height: float) -> Iterator[tuple[Figure, io.StringIO]]:
+    """Open a figure of the page's style, and the file that holds its SVG once the figure is left."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    drawn, file = Drawn(), io.StringIO()
+    svg = io.StringIO()
     style: Any = STYLE
     with rc_context(style):
-        canvas = Figure(figsize=(WIDTH, height), layout="constrained")
-        yield canvas, drawn
-        canvas.savefig(file, format="svg", transparent=True, metadata={"Date": None})
-    drawn.text = file.getvalue()
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        yield figure, svg
+        figure.savefig(svg, format="svg", transparent=True, metadata={"Date": None})
 
 
-def inline(drawn: Drawn, name: str, alternative: str) -> str:
+def inline(file: io.StringIO, name: str, alternative: str) -> str:
     """Return SVG to stand in a page: ids of its own, colours of the page, a text for those who cannot see it."""
-    svg = drawn.text[drawn.text.index("<svg") :]
+    svg = "<svg" + file.getvalue().partition("<svg")[2]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
     svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, flags=re.DOTALL)
@@ -270,3 +252,7 @@ def inline(drawn: Drawn, name: str, alternative: str) -> str:
     (box,) = re.findall(r'viewBox="[^"]*"', opening)
     head = f'<svg xmlns:xlink="http://www.w3.org/1999/xlink" {box} role="img" aria-labelledby="{name}-alt">'
     return f'{head}<title id="{name}-alt">{html.escape(alternative)}</title>{svg[len(opening) :]}'
+
+
+PICTURES = {"residuals": residuals, "sphere": sphere, "convergence": convergence, "dilution": dilution}
+"""The pictures of a report by name."""
