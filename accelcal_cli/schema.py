@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 import re
 import types
 import typing
@@ -46,11 +47,6 @@ class Limits:
     shape: tuple[int, ...] = ()
     older: Any = ...
 
-    @classmethod
-    def stated(cls, metadata: Mapping[str, Any]) -> Limits:
-        """Return the range in the metadata of a `setting`."""
-        return cls(metadata.get("low"), metadata.get("high"), metadata.get("above"))
-
     def check(self, value: Any, label: str) -> None:
         """Raise ConfigError when a number, or one in a tuple, is not finite or outside the range; `label` is named."""
         if isinstance(value, tuple):
@@ -60,12 +56,13 @@ class Limits:
             return
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{label}: {value} is not a finite number")
-        if self.low is not None and value < self.low:
-            raise ConfigError(f"{label}: {_short(value)} is too small; expected at least {self.low:g}")
-        if self.above is not None and value <= self.above:
-            raise ConfigError(f"{label}: {_short(value)} is too small; expected more than {self.above:g}")
-        if self.high is not None and value > self.high:
-            raise ConfigError(f"{label}: {_short(value)} is too large; expected at most {self.high:g}")
+        for limit, beyond, what in (
+            (self.low, operator.lt, "too small; expected at least"),
+            (self.above, operator.le, "too small; expected more than"),
+            (self.high, operator.gt, "too large; expected at most"),
+        ):
+            if limit is not None and beyond(value, limit):
+                raise ConfigError(f"{label}: {_short(value)} is {what} {limit:g}")
 
 
 def array(*shape: int, none: float | None = None, largest: float | None = None) -> Limits:
@@ -89,6 +86,14 @@ def check(instance: Any) -> None:
         limits.check(getattr(instance, name), name)
 
 
+class Checked:
+    """Base of dataclasses that refuse a number outside the range of its field, however they are made."""
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for it; see `check`."""
+        check(self)
+
+
 def _short(value: Any) -> str:
     """Return a value as a message shows it: a number of 400 digits is cut off."""
     text = repr(value)
@@ -101,17 +106,14 @@ def to_mapping(record: Any) -> dict[str, Any]:
     Mappings, arrays, sequences and dataclasses in it are taken apart likewise, and so is a mapping instead of a
     dataclass; NaN and infinity become None, since JSON has neither.
     """
-    mapping: dict[str, Any] = _plain(record)
-    return mapping
+    return dict(_plain(record))
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):  # YAML does not know the numbers of numpy either
         return _plain(value.tolist())
-    if isinstance(value, float):  # a float64 of numpy is one, too, which YAML does not know
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return _plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
     if isinstance(value, Mapping):
@@ -142,7 +144,9 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str, *, extra:
         elif not extra:
             known = ", ".join(fields) or "none"
             raise ConfigError(f'{where}: unknown key "{key}"{did_you_mean(str(key), fields)}; known: {known}')
-    missing = [name for name in _required(cls) if name not in values]
+    none = (dataclasses.MISSING, dataclasses.MISSING)
+    absent = (f for f in dataclasses.fields(typing.cast(Any, cls)) if f.name not in values)
+    missing = [f.name for f in absent if (f.default, f.default_factory) == none]
     if missing:
         raise ConfigError(f"{where}: missing: {', '.join(missing)}")
     try:
@@ -158,22 +162,17 @@ def _declared(cls: type) -> dict[str, tuple[Any, Limits]]:
     """Return type and limits of the fields of a dataclass by name; looked up once for each class."""
     if cls not in _DECLARED:
         hints = typing.get_type_hints(cls, include_extras=True)
-        _DECLARED[cls] = {
-            field.name: _apart(hints[field.name], Limits.stated(field.metadata))
-            for field in dataclasses.fields(cls)
-        }
+        ranges = (
+            (f.name, Limits(f.metadata.get("low"), f.metadata.get("high"), f.metadata.get("above")))
+            for f in dataclasses.fields(cls)
+        )
+        _DECLARED[cls] = {name: _apart(hints[name], limits) for name, limits in ranges}
     return _DECLARED[cls]
 
 
 def _apart(hint: Any, limits: Limits) -> tuple[Any, Limits]:
     """Return type and limits of `Annotated[type, Limits(...)]`; any other type with the limits that are given."""
     return typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint, limits)
-
-
-def _required(cls: Any) -> list[str]:
-    """Return the names of the fields without a default."""
-    none = (dataclasses.MISSING, dataclasses.MISSING)
-    return [f.name for f in dataclasses.fields(cls) if (f.default, f.default_factory) == none]
 
 
 def _convert(value: Any, hint: Any, limits: Limits, label: str, extra: bool) -> Any:

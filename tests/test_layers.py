@@ -104,7 +104,7 @@ def _tree(folder, files):
         ("calibration/quality.py", "from scipy import stats"),
         ("calibration/quality.py", "try:\n    import matplotlib\nexcept ImportError:\n    pass"),
         ("cli/plot.py", "class A:\n    import polars"),
-        ("sensor/gravity.py", "if True:\n    import boule"),
+        ("sensor/model.py", "if True:\n    import boule"),
         ("io/reader.py", "from accelcal_cli.io.parquet import ParquetTable"),
         ("io/reader.py", "from accelcal_cli.io import parquet"),
         ("helpers.py", "from accelcal_cli.sensor import model"),
@@ -121,7 +121,7 @@ def test_the_rule_sees_a_breach(tmp_path, file, text):
         ("calibration/search.py", "from accelcal_cli.optimization.optimizer import OPTIMIZERS"),
         ("io/parquet.py", "import polars"),
         ("io/reader.py", "def open_table():\n    from accelcal_cli.io.parquet import ParquetTable"),
-        ("sensor/gravity.py", "def normal():\n    import boule"),
+        ("sensor/model.py", "def normal():\n    import boule"),
         (
             "optimization/algorithms/pso.py",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import accelcal_cli.sensor",

@@ -10,8 +10,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
-from accelcal_cli.io.readings import Readings
-from accelcal_cli.io.screening import LOOKED_AT, RAW_ROWS, may_be_doubtful
+from accelcal_cli.io.readings import LOOKED_AT, RAW_ROWS, Readings, may_be_doubtful
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings

@@ -193,7 +193,7 @@ class GravityOptions:
         Raises:
             UsageError: out of range, stated twice, or a height without a latitude.
         """
-        from accelcal_cli.sensor.gravity import check_gravity, normal_gravity
+        from accelcal_cli.sensor.model import check_gravity, normal_gravity
 
         if self.g is not None and self.latitude is not None:
             raise UsageError("--g and --latitude: expected one of them, not both")

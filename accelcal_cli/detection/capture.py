@@ -58,8 +58,7 @@ class RoughSensor:
         """Return the unit directions of outputs, shape (..., 3)."""
         force = output - self.centre
         length = np.linalg.norm(force, axis=-1, keepdims=True)
-        unit: Float = force / np.where(length > 0, length, 1.0)
-        return unit
+        return np.asarray(force / np.where(length > 0, length, 1.0))
 
 
 def fit_rough_sensor(outputs: Float, scale: float | None, centre: Float | None) -> RoughSensor:
@@ -195,9 +194,8 @@ class Capture:
 
     def directions(self) -> Float:
         """Return the directions of the captured poses, as far as they are known, shape (J, 3)."""
-        if self.rough is None:
-            return np.zeros((0, 3))
-        return self.rough.directions(np.array([pose.mean for pose in self.poses]))
+        means = np.array([pose.mean for pose in self.poses])
+        return np.zeros((0, 3)) if self.rough is None else self.rough.directions(means)
 
     def recognised(self) -> list[int | None]:
         """Return the planned pose that each captured pose is, None for one that is not planned.

@@ -117,9 +117,8 @@ class Detection:
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
-        notes = (*self.notes, self.summary())
         return readings_of(self.intervals, self.source).known_as(
-            self.sha256, self.columns, notes, self.intervals.where
+            self.sha256, self.columns, (*self.notes, self.summary()), self.intervals.where
         )
 
     def summary(self) -> str:
@@ -192,11 +191,11 @@ def evaluate(segmentation: Segmentation, g: float) -> CandidateThreshold:
     poses = len(intervals)
     if poses < 2 or not np.ptp(intervals.mean, axis=0).any():
         return CandidateThreshold(multiplier, poses, min(poses, 1))
-    fit = screen(readings_of(intervals, "log"), g)
-    distinct = len(attitudes(directions_of(intervals.mean, fit.model), intervals.n, DISTINCT))
-    sigma = float(fit.s * fit.dop * np.sqrt(poses / distinct))
+    model, rms, worst, verdict = screen(readings_of(intervals, "log"), g)
+    distinct = len(attitudes(directions_of(intervals.mean, model), intervals.n, DISTINCT))
+    sigma = worst * math.sqrt(poses / distinct)
     return CandidateThreshold(
-        multiplier, poses, distinct, fit.rms, sigma if math.isfinite(sigma) else math.inf, fit.verdict
+        multiplier, poses, distinct, rms, sigma if math.isfinite(sigma) else math.inf, verdict
     )
 
 
@@ -223,7 +222,7 @@ def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
     angle = settings.merge if settings.merge is not None else settings.thin
     if angle is None:
         return intervals
-    model = screen(readings_of(intervals, "log"), settings.g).model
+    model, *_ = screen(readings_of(intervals, "log"), settings.g)
     groups = attitudes(directions_of(intervals.mean, model), intervals.n, angle)
     if settings.merge is None:
         return intervals.take(np.sort(np.array([group[0] for group in groups])))
@@ -278,15 +277,18 @@ def _advise(segmentation: Segmentation, count: CandidateThreshold, detection: De
     if count.poses >= least and not (restless and len(turning)):
         return "turn the sensor to more attitudes, or accept fewer with --min-poses"
     if restless:
-        scatter = f"{math.sqrt(level.quietest):.3g} where the readings change by {level.extent:.3g}"
-        return f"no part of the log is still: even its quietest window scatters by {scatter}"
+        return (
+            "no part of the log is still: even its quietest window scatters by "
+            f"{math.sqrt(level.quietest):.3g} where the readings change by {level.extent:.3g}"
+        )
     if len(turning) > count.poses:
         return "put the sensor down, or hold it against something, in each pose: it turns slowly all the time"
     if count.poses + np.count_nonzero(short > 1.5 * detection.rows.window) >= least:
         return "hold each pose longer, or lower --min-length or --trim"
-    highest = max(detection.settings.multipliers)
-    beyond = f"--multiplier above {highest:g}, a shorter --window or a lower --min-length"
-    return f"record more poses held still; if the log has more, try {beyond}"
+    return (
+        "record more poses held still; if the log has more, try --multiplier above "
+        f"{max(detection.settings.multipliers):g}, a shorter --window or a lower --min-length"
+    )
 
 
 def _counted(number: int, what: str) -> str:
@@ -300,25 +302,13 @@ def _stretches(lengths: Int) -> str:
     return f"{_counted(len(lengths), 'stretch')} of {span} rows"
 
 
-@dataclass(frozen=True)
-class Screened:
-    """What a set of poses is worth.
+def screen(readings: Readings, g: float) -> tuple[ErrorModel, float, float, str]:
+    """Calibrate readings that carry count and scatter, weighted by both and by what the poses share.
 
-    Attributes:
-        model: the sensor they fit; rms: of |f| - g, m/s^2, NaN where the poses fix no ellipsoid.
-        s: standard deviation of one pose's modulus, m/s^2; NaN for nine poses or fewer.
-        dop: the worst dilution of precision; verdict: good, weak or undetermined.
+    Returns:
+        The sensor they fit; rms of |f| - g, m/s^2, NaN where the poses fix no ellipsoid; sigma of the worst parameter,
+        m/s^2, NaN for nine poses or fewer; the verdict: good, weak or undetermined.
     """
-
-    model: ErrorModel
-    rms: float
-    s: float
-    dop: float
-    verdict: str
-
-
-def screen(readings: Readings, g: float) -> Screened:
-    """Calibrate readings that carry count and scatter, weighted by both and by what the poses share."""
     sample, settings = Sample.of([readings]), Settings("levenberg-marquardt", g=g, weights="auto")
     plain = state(sample, replace(settings, weights="none"))
     if plain.start.sources[0] == "sphere":
@@ -326,13 +316,9 @@ def screen(readings: Readings, g: float) -> Screened:
         middle = np.zeros_like(plain.cost.box.centre)
         if Observability.of(plain.cost.information(middle)[0], readings.poses).verdict == "undetermined":
             K, D = plain.cost.parameters(middle)
-            return Screened(ErrorModel(K[0], D[0]), np.nan, np.nan, np.inf, "undetermined")
+            return ErrorModel(K[0], D[0]), math.nan, math.nan, "undetermined"
     result = fit(search(state(sample, settings), closed=True))
     view = result.observability[0]
-    return Screened(
-        ErrorModel(result.lower[0], result.D[0]),
-        float(result.rms[0]),
-        float(result.s[0]),
-        float(view.worst),
-        "undetermined" if result.at_wall.any() else view.verdict,
-    )
+    verdict = "undetermined" if result.at_wall.any() else view.verdict
+    model = ErrorModel(result.lower[0], result.D[0])
+    return model, float(result.rms[0]), float(result.s[0]) * float(view.worst), verdict

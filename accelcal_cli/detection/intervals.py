@@ -85,9 +85,8 @@ class Intervals:
 
     def where(self, i: int) -> str:
         """Return how to name an interval (from 0) to the user: ``rows 888 to 1357``, or by its times."""
-        if self.time is not None:
-            return f"time {self.time[i, 0]:.10g} to {self.time[i, 1]:.10g}"
-        return f"rows {self.start[i]} to {self.end[i]}"
+        rows = f"rows {self.start[i]} to {self.end[i]}"
+        return rows if self.time is None else f"time {self.time[i, 0]:.10g} to {self.time[i, 1]:.10g}"
 
 
 @dataclass(frozen=True)
@@ -231,25 +230,22 @@ def merge(intervals: Intervals, groups: Sequence[Int]) -> Intervals:
     """Return one interval for each group: it spans them all, and its rows are theirs taken together."""
     first = np.array([group.min() for group in groups], dtype=np.intp)
     last = np.array([group.max() for group in groups], dtype=np.intp)
-    n, mean, scatter = [], [], []
-    for group in groups:
-        rows, centre = intervals.n[group], intervals.mean[group]
-        total = rows.sum()
-        middle = (rows[:, None] * centre).sum(axis=0) / total
-        within = ((rows - 1)[:, None] * intervals.scatter[group] ** 2).sum(axis=0)
-        n.append(total)
-        mean.append(middle)
+    n = np.array([intervals.n[group].sum() for group in groups])
+    mean, scatter = np.empty((len(groups), 3)), np.empty((len(groups), 3))
+    for k, group in enumerate(groups):
+        rows = intervals.n[group][:, None]
+        mean[k] = (rows * intervals.mean[group]).sum(axis=0) / n[k]
         # Scatter within the intervals: how they differ is the attitude's, not the noise of a reading.
-        scatter.append(np.sqrt(within / max(total - len(group), 1)))
+        within = ((rows - 1) * intervals.scatter[group] ** 2).sum(axis=0)
+        scatter[k] = np.sqrt(within / max(n[k] - len(group), 1))
     time = intervals.time
-    spans = None if time is None else np.stack([time[first, 0], time[last, 1]], axis=1)
     return replace(
         intervals.take(first),
         end=intervals.end[last],
-        n=np.array(n),
-        mean=np.array(mean),
-        scatter=np.array(scatter),
-        time=spans,
+        n=n,
+        mean=mean,
+        scatter=scatter,
+        time=None if time is None else np.stack([time[first, 0], time[last, 1]], axis=1),
     )
 
 

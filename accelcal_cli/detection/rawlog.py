@@ -72,9 +72,8 @@ class RawLog:
         self.name = table.name
         self.columns = columns
         self._table = table
-        self._rows = table.blocks(columns.selection())
-        if columns.dated:
-            self._rows = seconds_of_dates(self._rows, self._time_at)
+        rows = table.blocks(columns.selection())
+        self._rows = seconds_of_dates(rows, self._time_at) if columns.dated else rows
         self._head = _first(self._rows, PROBE)
         self.clock = Clock()
         self.notes = list(columns.notes)
@@ -141,14 +140,13 @@ class RawLog:
 
     def _check_time(self, time: Float, last: float, start: int) -> None:
         back = np.diff(time, prepend=last) < 0
-        if not back.any():
-            return
-        row = int(np.argmax(back))
-        before = time[row - 1] if row else last
-        raise DataError(
-            f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
-            "time that never decreases (--time none leaves it out)"
-        )
+        if back.any():
+            row = int(np.argmax(back))
+            before = time[row - 1] if row else last
+            raise DataError(
+                f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
+                "time that never decreases (--time none leaves it out)"
+            )
 
 
 @dataclass(frozen=True)

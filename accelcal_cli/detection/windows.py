@@ -139,10 +139,9 @@ class Spans:
 
     @staticmethod
     def _of(span: Span | None, rate: float | None, option: str, seconds: float, rows: int) -> int:
-        if span is None:
-            span = Span(rows, True) if rate is None else Span(seconds)
-            return max(2, span.rows(rate, option))
-        return span.rows(rate, option)
+        if span is not None:
+            return span.rows(rate, option)
+        return max(2, rows if rate is None else Span(seconds).rows(rate, option))
 
 
 def longest_step(clock: Clock, lengths: RowLengths) -> float:
@@ -193,8 +192,7 @@ class Gaps:
         """Return which windows of `width` tiles have a gap in them, shape (B - width + 1,)."""
         before, within = self.late(start, end, start[0])
         count = np.append(0, np.cumsum(before.astype(np.int64) + within))
-        broken: Bool = count[width:] - count[:-width] > before[: len(start) - width + 1]
-        return broken
+        return np.asarray(count[width:] - count[:-width] > before[: len(start) - width + 1])
 
     def notes(self, unit: str) -> list[str]:
         """Say what gaps there are, if any, in one sentence; `unit` is that of the time column."""
@@ -254,9 +252,8 @@ class Tiles:
         tiles = block.shape[1] // self.size
         if not tiles:
             return
-        sensors = 6 if self.gyro else 3
         out = np.empty((tiles, self._store.width))
-        for k in range(sensors):
+        for k in range(6 if self.gyro else 3):
             part = block[k].reshape(tiles, self.size)
             at = k if k < 3 else k + 3  # mean, squares, mean of the gyroscope, its squares
             mean = np.add.reduce(part, axis=1) / self.size
@@ -309,8 +306,7 @@ class Windows:
 
     def turning(self, bias: Float) -> Float:
         """Return the mean square of the turning rate about its bias, shape (B,)."""
-        turning: Float = self.spread + ((self.rate - bias) ** 2).sum(axis=1)
-        return turning
+        return np.asarray(self.spread + ((self.rate - bias) ** 2).sum(axis=1))
 
 
 def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
@@ -325,9 +321,8 @@ def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
         if tiles.gyro:
             rate, turned = _window(block[:, 6:12], tiles.size, width, take)
             spread = turned.sum(axis=0)
-        broken = np.zeros(variance.shape[1], dtype=bool)
-        if tiles.timed:
-            broken = tiles.gaps.spanned(block[:, -2], block[:, -1], width)[start::step]
+        gaps = tiles.gaps.spanned(block[:, -2], block[:, -1], width) if tiles.timed else None
+        broken = np.zeros(variance.shape[1], dtype=bool) if gaps is None else gaps[start::step]
         norm = np.sqrt(variance[0] ** 2 + variance[1] ** 2 + variance[2] ** 2)
         yield Windows(first + start, mean.T, norm, rate.T, spread, broken)
 
@@ -363,8 +358,8 @@ class Envelope:
         least = np.column_stack([tiles.min(axis=2).T, -tiles.max(axis=2).T, start])
         self._open = np.concatenate([self._open, least])
         whole = len(self._open) // self.per_bin * self.per_bin
-        self._bins = np.concatenate([self._bins, _fold(self._open[:whole], self.per_bin)])
-        self._open = self._open[whole:]
+        full, self._open = self._open[:whole], self._open[whole:]
+        self._bins = np.concatenate([self._bins, _fold(full, self.per_bin)])
         while len(self._bins) > MOST_BINS:
             self._halve()
 
@@ -372,9 +367,8 @@ class Envelope:
         """Return first row (b,) or time (b,) where there is time, least and greatest output (b, 3) of each bin."""
         bins = np.concatenate([self._bins, _fold(self._open, max(len(self._open), 1))])
         low, high, time = bins[:, :3], -bins[:, 3:6], bins[:, 6]
-        if np.isnan(time).any():
-            return np.arange(len(bins), dtype=np.float64) * (self.size * self.per_bin), low, high
-        return time, low, high
+        first = np.arange(len(bins), dtype=np.float64) * (self.size * self.per_bin)
+        return first if np.isnan(time).any() else time, low, high
 
     def _halve(self) -> None:
         """Join bins two by two; a last one without a partner waits among the open tiles."""
@@ -386,5 +380,4 @@ class Envelope:
 
 
 def _fold(bins: Float, by: int) -> Float:
-    least: Float = bins.reshape(-1, by, 7).min(axis=1)
-    return least
+    return np.asarray(bins.reshape(-1, by, 7).min(axis=1))

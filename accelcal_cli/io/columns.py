@@ -168,10 +168,11 @@ def choose(table: Table, wanted: Sequence[str] | None = None, sensor: int | None
         output = _only_family(table, roles)
     else:
         output = _only_three(table, roles, sensor)
-        if names is None:
-            notes = (f"no header: columns {_numbered(output)} taken as x, y, z",)
-        else:
-            notes = (f"columns {_listed(names, output)} taken as x, y, z: the only three that can be",)
+        notes = (
+            f"no header: columns {_numbered(output)} taken as x, y, z"
+            if names is None
+            else f"columns {_listed(names, output)} taken as x, y, z: the only three that can be",
+        )
     return _with_extras(table, output, roles, notes, sensor)
 
 
@@ -309,23 +310,21 @@ def recognise(names: Sequence[str]) -> Roles:
                 _put(group, axis, column)
     roles.families = {_listed(names, triple): triple for _, triple in _triples(output)}
     roles.doubtful = [names[column] for column in _left_over(output, 1)]
-    for family, triple in _triples(spread):
-        roles.scatter.setdefault(family, triple)
+    roles.scatter = dict(reversed(_triples(spread)))  # of two triples of one family the first stays
     roles.reference = next((triple for _, triple in _triples(reference)), None)
     roles.gyro = next((triple for _, triple in _triples(gyro)), None)
-    for group, what in ((spread, "standard deviation"), (reference, "reference")):
-        roles.partial += [
-            f'column "{names[k]}" not used: no {what} for all three axes' for k in _left_over(group)
-        ]
+    roles.partial = [
+        f'column "{names[k]}" not used: no {what} for all three axes'
+        for group, what in ((spread, "standard deviation"), (reference, "reference"))
+        for k in _left_over(group)
+    ]
     return roles
 
 
 def tokens_of(name: str) -> list[str]:
     """Return the words of a column name in lower case, without units and without "mean"."""
-    name = re.sub(r"_?m_s_?2", "", name)
-    name = _INDEX.sub(lambda match: "_" + AXES[int(match[1])], name)
-    words = re.split(r"[^a-z0-9]+", _CAMEL.sub("_", _BRACKETS.sub(" ", name)).lower())
-    words = [word for word in words if word]
+    name = _INDEX.sub(lambda match: "_" + AXES[int(match[1])], re.sub(r"_?m_s_?2", "", name))
+    words = re.findall(r"[a-z0-9]+", _CAMEL.sub("_", _BRACKETS.sub(" ", name)).lower())
     while len(words) > 1 and _UNITS.fullmatch(words[-1]):
         words.pop()
     return [word for word in words if word not in _MEAN] or words
@@ -347,9 +346,14 @@ def _only_family(table: Table, roles: Roles) -> Triple:
 def _only_three(table: Table, roles: Roles, sensor: int | None) -> Triple:
     """Return the three columns whose names do not say that they are something else, if there are just three."""
     names, width = table.names, len(table.numeric)
-    known = {*(roles.reference or ()), *roles.alone["other"], *roles.alone["sensor"], sensor}
-    known.update(roles.first(role) for role in ("count", "temperature", "label"))
-    known.update(column for triple in roles.scatter.values() for column in triple)
+    known = {
+        *(roles.reference or ()),
+        *roles.alone["other"],
+        *roles.alone["sensor"],
+        sensor,
+        *(roles.first(role) for role in ("count", "temperature", "label")),
+        *(column for triple in roles.scatter.values() for column in triple),
+    }
     left = [k for k in range(width) if k not in known]
     if names is not None and len(left) > 3:
         left = [k for k in left if table.numeric[k]]
@@ -449,9 +453,8 @@ def _axis(key: str, prefixes: Sequence[str]) -> tuple[str, str] | None:
     """Return family and axis of a key such as accx, xacc or xaxis."""
     if key[-1] in AXES and key[:-1] in prefixes:
         return key[:-1], key[-1]
-    if key[0] in AXES and key[1:] in (*_ACCELERATION, "axis") and "a" in prefixes:
-        return key[1:], key[0]
-    return None
+    leading = key[0] in AXES and key[1:] in (*_ACCELERATION, "axis") and "a" in prefixes
+    return (key[1:], key[0]) if leading else None
 
 
 def _spread(words: Sequence[str], key: str) -> tuple[str, str] | None:

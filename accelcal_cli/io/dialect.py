@@ -151,22 +151,19 @@ def _uneven(first: str, second: str, lines: list[str]) -> bool:
 
 def _decimal_comma(lines: list[str], separator: str) -> bool:
     """Return whether the first fraction among the data is written with a comma."""
-    for line in lines:
-        if "," not in line and "." not in line:
-            continue
-        for cell in split_cells(line, separator):
-            if _DECIMAL_COMMA.fullmatch(cell):
-                return True
-            if "." in cell and looks_numeric(cell):
-                return False
-    return False
+    rows = (split_cells(line, separator) for line in lines if "," in line or "." in line)
+    commas = (
+        (_DECIMAL_COMMA.fullmatch(cell) is not None, "." in cell and looks_numeric(cell))
+        for row in rows
+        for cell in row
+    )
+    return next((comma for comma, point in commas if comma or point), False)
 
 
 def _header_cells(line: str, separator: str) -> list[str]:
     """Return the cells of a header; a unit in brackets belongs to the name before it, blank or not."""
-    if separator == " " and '"' not in line:
-        return re.split(r"\s+(?![\[(])", line.strip())
-    return split_cells(line, separator)
+    aligned = separator == " " and '"' not in line
+    return re.split(r"\s+(?![\[(])", line.strip()) if aligned else split_cells(line, separator)
 
 
 def _is_header(cells: list[str], second: list[str]) -> bool:

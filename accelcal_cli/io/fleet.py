@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,8 +18,15 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_column
 from accelcal_cli.io.reader import RowBlock, Table, open_table
-from accelcal_cli.io.readings import LabelledMeans, Readings, check_rows
-from accelcal_cli.io.screening import LOOKED_AT, doubts, log_cautions
+from accelcal_cli.io.readings import (
+    LOOKED_AT,
+    LabelledMeans,
+    Readings,
+    check_rows,
+    doubts,
+    log_cautions,
+    number_labels,
+)
 from accelcal_cli.io.stream import RowStore
 
 SLAB = 2_000_000
@@ -84,11 +91,8 @@ class Batch:
 
     def take(self, index: Int) -> Batch:
         """Return the sensors at `index`."""
-        behind = None if self.behind is None else self.behind[index]
-        scatter = None if self.scatter is None else self.scatter[index]
-        return Batch(
-            self.sensors[index], self.count[index], self.output[index], self.pose[index], behind, scatter
-        )
+        arrays = {part.name: getattr(self, part.name) for part in fields(self)}
+        return replace(self, **{name: array[index] for name, array in arrays.items() if array is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +125,12 @@ class FleetReadings:
         """Return the readings of the sensor at `at` in a batch, as `calibrate` takes them."""
         count, poses = int(batch.count[at]), batch.pose[at]
         origin, name = self.origin(int(poses[0])), self.sensors[batch.sensors[at]]
-        readings = Readings.from_array(
+        return Readings.from_array(
             batch.output[at, :count],
             source=f'{origin.name}, sensor "{name}"',
             count=_known(batch.behind, at, count),
             scatter=_known(batch.scatter, at, count),
-        )
-        return readings.known_as(
+        ).known_as(
             origin.sha256,
             origin.columns,
             origin.notes,
@@ -138,17 +141,13 @@ class FleetReadings:
     def cautions(self, batch: Batch, at: int) -> tuple[str, ...]:
         """Return why the readings of the sensor at `at` in a batch may not be poses, in sentences."""
         origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
-        first = output[:LOOKED_AT]
-        log: tuple[str, ...] = ()
-        if origin.rows:
-            span = float(np.ptp(output, axis=0).max())
-            log = log_cautions(len(output), first, span, timed=origin.timed)
+        first, span = output[:LOOKED_AT], float(np.ptp(output, axis=0).max())
+        log = log_cautions(len(output), first, span, timed=origin.timed) if origin.rows else ()
         return (*log, *doubts(first, origin.columns))
 
     def batches(self) -> Iterator[Batch]:
         """Yield every sensor once, in batches of about equally many poses."""
-        ends = np.cumsum(self.poses)
-        first = 0
+        ends, first = np.cumsum(self.poses), 0
         while first < len(ends):
             start = int(ends[first] - self.poses[first])
             last = max(int(np.searchsorted(ends, start + SLAB, side="right")), first + 1)
@@ -192,11 +191,11 @@ def _gather(store: RowStore, numbers: Int) -> Float:
     """Return the rows of these numbers, which ascend."""
     if len(numbers) == store.rows:
         return store.all()
-    parts = []
-    for start, block in store.blocks():
-        low, high = np.searchsorted(numbers, (start, start + len(block)))
-        parts.append(block[numbers[low:high] - start])
-    return np.concatenate(parts)
+    placed = (
+        (start, block, *np.searchsorted(numbers, (start, start + len(block))))
+        for start, block in store.blocks()
+    )
+    return np.concatenate([block[numbers[low:high] - start] for start, block, low, high in placed])
 
 
 def _groups(counts: Int) -> Iterator[slice]:
@@ -204,8 +203,8 @@ def _groups(counts: Int) -> Iterator[slice]:
     first = 0
     while first < len(counts):
         longest = int(STRETCH * counts[first])
-        last = int(np.searchsorted(counts, longest, side="right"))
-        last = min(last, first + max(1, BATCH // longest))
+        alike = int(np.searchsorted(counts, longest, side="right"))
+        last = min(alike, first + max(1, BATCH // longest))
         yield slice(first, last)
         first = last
 
@@ -249,7 +248,8 @@ def read_fleet(
             f"{label}: every row has another sensor; expected several poses of each (--sensor-column says which "
             "column labels the sensor)"
         )
-    return collector.fleet(label)
+    sensors, origins = tuple(collector.index), tuple(collector.origins)
+    return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras)
 
 
 def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
@@ -263,20 +263,15 @@ def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
     return names if len(set(names)) == len(names) else sources
 
 
+@dataclass(eq=False)
 class _FleetCollector:
     """Gathers the rows of tables into poses of sensors."""
 
-    def __init__(self) -> None:
-        self.index: dict[str, int] = {}
-        self.poses: Int = np.zeros(0, dtype=np.intp)
-        self.store = RowStore(4)
-        self.extras: RowStore | None = None
-        self.origins: list[TableOrigin] = []
-
-    def fleet(self, source: str) -> FleetReadings:
-        return FleetReadings(
-            source, tuple(self.index), self.poses, tuple(self.origins), self.store, self.extras
-        )
+    index: dict[str, int] = field(default_factory=dict)
+    poses: Int = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    store: RowStore = field(default_factory=lambda: RowStore(4))
+    extras: RowStore | None = None
+    origins: list[TableOrigin] = field(default_factory=list)
 
     def read(self, table: Table, wanted: Sequence[str] | None, sensor: str | None, name: str | None) -> None:
         """Read one table: of the sensor `name`, or of many."""
@@ -291,7 +286,8 @@ class _FleetCollector:
             if not len(rows.numbers):
                 continue
             check_rows(table, columns, rows)
-            codes = self._codes(rows.texts[0] if name is None else _only(table, columns, rows, name))
+            labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
+            codes = number_labels(self.index, labels)
             output, (count, scatter, _) = rows.numbers[:, :3], columns.split(rows.numbers[:, 3:])
             if means is None:
                 self._add(codes, output, count, scatter)
@@ -312,11 +308,6 @@ class _FleetCollector:
                 timed=columns.time is not None,
             )
         )
-
-    def _codes(self, labels: Sequence[str]) -> Int:
-        """Return the numbers of sensors, shape (B,), by their labels; a new one gets the next."""
-        index = self.index
-        return np.fromiter((index.setdefault(label, len(index)) for label in labels), np.intp, len(labels))
 
     def _add(self, codes: Int, output: Float, behind: Float | None, scatter: Float | None) -> None:
         """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""

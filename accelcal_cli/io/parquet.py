@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -55,17 +55,16 @@ class ParquetTable:
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns."""
         wanted = dict.fromkeys(self.names[k] for k in (*selection.numbers, *selection.texts))
-        return (rows for _, rows in self._read(selection, list(wanted)))
+        return (rows for _, rows in self.pairs(selection, list(wanted)))
 
-    def pairs(self, selection: Selection) -> Iterator[tuple[pl.DataFrame, RowBlock]]:
-        """Read blocks of all columns, each with the selected columns of its rows."""
-        return self._read(selection, list(self.names))
-
-    def _read(self, selection: Selection, wanted: list[str]) -> Iterator[tuple[pl.DataFrame, RowBlock]]:
+    def pairs(
+        self, selection: Selection, wanted: Sequence[str] | None = None
+    ) -> Iterator[tuple[pl.DataFrame, RowBlock]]:
+        """Read blocks of all columns, or of those `wanted`, each with the selected columns of its rows."""
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
-        lazy, start = pl.scan_parquet(self._path).select(wanted), 0
+        lazy, start = pl.scan_parquet(self._path).select(wanted or self.names), 0
         while not (frame := self._batch(lazy, start)).is_empty():
             numbers = np.empty((frame.height, len(selection.numbers)))
             for k, column in enumerate(selection.numbers):
@@ -109,8 +108,7 @@ class ParquetTable:
     def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
         bad = ~(np.abs(numbers) <= LIMIT) & ~(np.isnan(numbers) & gaps)
         if bad.any():
-            row = int(np.argmax(bad))
-            value = numbers[row]
+            row, value = int(np.argmax(bad)), numbers[np.argmax(bad)]
             what = "is empty or nan" if np.isnan(value) else f"{value:g} is too large or infinite"
             raise DataError(f"{self._place(start + row, column)}: {what}; a finite number was expected")
 

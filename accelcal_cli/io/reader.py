@@ -172,17 +172,16 @@ class LineMap:
         return f"line {self.line(row)}"
 
 
+@dataclass(eq=False)
 class CarefulParser:
-    """Parses text blocks row by row, and keeps count of rows and lines across blocks."""
+    """Parses text blocks of one dialect row by row, and keeps count of rows and lines across blocks."""
 
-    def __init__(self, source: str, dialect: Dialect, selection: Selection) -> None:
-        """Parse tables of one dialect; `source` is named in messages."""
-        self.source = source
-        self.dialect = dialect
-        self.selection = selection
-        self.lines = LineMap()
-        self.row = 0  # rows so far
-        self.line = 0  # lines so far
+    source: str  # named in messages
+    dialect: Dialect
+    selection: Selection
+    lines: LineMap = field(default_factory=LineMap)
+    row: int = 0  # rows so far
+    line: int = 0  # lines so far
 
     def parse(self, block: bytes) -> RowBlock:
         """Return the rows of a block of whole lines; the first wrong cell raises DataError."""
@@ -245,6 +244,7 @@ class CarefulParser:
         return f"{here}, column {name}"
 
 
+@dataclass(eq=False)
 class FastParser:
     """Parses what polars reads beyond doubt, and hands every other block to the careful parser.
 
@@ -252,9 +252,7 @@ class FastParser:
     So the careful parser alone defines what a table means, and words every error.
     """
 
-    def __init__(self, careful: CarefulParser) -> None:
-        """Share rows, lines and selection with `careful`."""
-        self.careful = careful
+    careful: CarefulParser  # whose rows, lines and selection it shares
 
     def parse(self, block: bytes) -> RowBlock:
         """Return the rows of a block of whole lines."""
@@ -289,10 +287,8 @@ class FastParser:
     def _rows(self, block: bytes) -> RowBlock | None:
         """Return the rows of a block that polars can read, None where a cell is missing or out of range."""
         frame, selection = self._frame(block), self.careful.selection
-        if frame is None:
-            return None
-        series = [frame[str(column)] for column in selection.numbers]
-        if any(column.null_count() for column in series):
+        series = [] if frame is None else [frame[str(column)] for column in selection.numbers]
+        if frame is None or any(column.null_count() for column in series):
             return None
         numbers = np.array(
             [column.to_numpy() for column in series]
@@ -300,15 +296,12 @@ class FastParser:
         if not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
             return None
         texts = tuple([(cell or "").strip() for cell in frame[str(k)].to_list()] for k in selection.texts)
-        if not all(all(text) for text in texts):
-            return None
-        return RowBlock(self.careful.skip(len(frame)), numbers, texts)
+        return RowBlock(self.careful.skip(len(frame)), numbers, texts) if all(map(all, texts)) else None
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
 
-        dialect, selection = self.careful.dialect, self.careful.selection
-        quoted = b'"' in block
+        dialect, selection, quoted = self.careful.dialect, self.careful.selection, b'"' in block
         schema = {str(k): pl.Float64 if k in selection.numbers else pl.String for k in range(dialect.width)}
         try:
             frame = pl.read_csv(
@@ -321,26 +314,22 @@ class FastParser:
             )
         except pl.exceptions.PolarsError:
             return None
-        if quoted and _count(block, "\n") != len(frame):
-            return None  # a cell goes on over the end of its line
+        # More line ends than rows: a cell goes on over the end of its line.
+        broken = quoted and _count(block, "\n") != len(frame)
         # A null in the last column is an empty cell, or a row that is short.
-        if frame[str(dialect.width - 1)].null_count() and (
+        short = frame[str(dialect.width - 1)].null_count() and (
             quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
-        ):
-            return None
-        return frame
+        )
+        return None if broken or short else frame
 
 
 def to_number(cell: str, decimal_comma: bool) -> float | None:
     """Return the value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
-    if decimal_comma:
-        if "." in cell:
-            return None  # 1.234,5 and 1.234 would be thousands here
-        cell = cell.replace(",", ".", 1)
-    if "_" in cell or not cell.isascii():
+    thousands = decimal_comma and "." in cell  # 1.234,5 and 1.234
+    if thousands or "_" in cell or not cell.isascii():
         return None
     try:
-        return float(cell)
+        return float(cell.replace(",", ".", 1) if decimal_comma else cell)
     except ValueError:
         return None
 
@@ -355,15 +344,12 @@ def _describe_cell(cell: str, value: float | None, decimal_comma: bool) -> str:
     if not cell:
         return "is empty; a number was expected"
     shown = shorten(cell)
-    if value is None:
-        if decimal_comma and "." in cell:
-            return f"{shown} is not a number here: this file writes fractions with a comma"
-        if "," in cell and not decimal_comma:
-            return f"{shown} is not a number here: this file writes fractions with a point"
-        return f"{shown} is not a number"
-    if math.isfinite(value):
-        return f"{shown} is too large for a reading (limit {LIMIT:g})"
-    return f"{shown} is not a finite number"
+    if value is not None:
+        too_large = f"too large for a reading (limit {LIMIT:g})"
+        return f"{shown} is {too_large if math.isfinite(value) else 'not a finite number'}"
+    foreign, mark = (".", "comma") if decimal_comma else (",", "point")
+    here = f" here: this file writes fractions with a {mark}" if foreign in cell else ""
+    return f"{shown} is not a number{here}"
 
 
 def has_outer_blank_line(block: bytes) -> bool:

@@ -1,7 +1,8 @@
 """Static readings of an accelerometer, one row per pose, and the way there from a table or an array.
 
 `read_readings` gathers the rows of a table into poses: one per row, or one per label, averaged as the rows stream by
-(`LabelledMeans`). The outputs stay in a store that may be on disk; a calibration takes them in blocks.
+(`LabelledMeans`). The outputs stay in a store that may be on disk; a calibration takes them in blocks. Before anything
+is fitted, `log_cautions` and `doubts` say what makes them doubtful: logs, dead or duplicate axes, copied rows.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, choose
 from accelcal_cli.io.reader import LIMIT, RowBlock, Table, open_table
-from accelcal_cli.io.screening import LOOKED_AT, doubts, log_cautions
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 
 STUCK = 1_000_000
@@ -27,6 +27,20 @@ STUCK = 1_000_000
 
 MOST_LABELS = 1_000_000
 """Different labels of poses at most: their means are kept in memory."""
+
+RAW_ROWS = 500
+"""From so many rows on, rows with a time each, or each much like the one before, are a raw log rather than poses."""
+
+ALIKE, LOOKED_AT = 0.05, 4096
+"""Poses differ from one to the next; most of the first LOOKED_AT rows of a log differ by less than this part of the
+range."""
+
+MANY_COPIES = 1 / 3
+"""Part of the poses from which on copies are reported. One row that occurs twice does no harm, and readings without
+noise repeat where an attitude does."""
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Pairs of axes."""
 
 Label = TypeVar("Label", bound=Hashable)
 
@@ -129,9 +143,13 @@ class Readings:
         cautions: tuple[str, ...] | None = None,
     ) -> Self:
         """Return the same poses as those of another input, with its cautions if stated."""
-        cautions = self.cautions if cautions is None else cautions
         return replace(
-            self, sha256=sha256, columns=columns, notes=tuple(notes), cautions=cautions, _line=where
+            self,
+            sha256=sha256,
+            columns=columns,
+            notes=tuple(notes),
+            cautions=self.cautions if cautions is None else cautions,
+            _line=where,
         )
 
 
@@ -160,13 +178,10 @@ def read_readings(
 def check_rows(table: Table, columns: Columns, rows: RowBlock) -> None:
     """Refuse counts that are not whole numbers of 1 or more, and standard deviations below zero."""
     for at, column in enumerate(columns.extras, 3):
-        if column == columns.count:
-            bad, expected = _are_no_counts(rows.numbers[:, at]), "count of 1 or more"
-        elif column in (columns.scatter or ()):
-            bad, expected = rows.numbers[:, at] < 0, "standard deviation of 0 or more"
-        else:
-            continue
-        if bad.any():
+        counts, values = column == columns.count, rows.numbers[:, at]
+        bad = _are_no_counts(values) if counts else values < 0
+        if (counts or column in (columns.scatter or ())) and bad.any():
+            expected = "count of 1 or more" if counts else "standard deviation of 0 or more"
             where = table.where(rows.start + int(np.argmax(bad)))
             raise DataError(
                 f'{table.name}, {where}, column "{(table.names or ())[column]}": a {expected} was expected'
@@ -194,8 +209,8 @@ class Collector:
         output, extras = rows.numbers[:, :3], rows.numbers[:, 3:]
         self.rows += len(output)
         self._widen(output)
-        if self._stuck and self.rows >= STUCK:
-            raise DataError(f"{self.source}: the first {self.rows:,} readings are all equal, {self._value()}")
+        if self.rows >= STUCK:
+            self._refuse_equal(f"the first {self.rows:,} readings are all equal")
         if self._means is not None:
             count, scatter, others = self.columns.split(extras)
             self._means.add(rows.texts[0], np.hstack([output, others]), count, scatter)
@@ -225,10 +240,8 @@ class Collector:
         count, scatter, others = extras
         self._check()
         _, first = next(self.store.blocks(LOOKED_AT))
-        log: tuple[str, ...] = ()
-        if means is None:
-            span = float((self.upper - self.lower).max())
-            log = log_cautions(self.store.rows, first, span, timed=columns.time is not None)
+        span, timed = float((self.upper - self.lower).max()), columns.time is not None
+        log = log_cautions(self.store.rows, first, span, timed=timed) if means is None else ()
         return Readings(
             self.source,
             sha256,
@@ -251,8 +264,7 @@ class Collector:
         """Let the means of the labels be the poses."""
         if len(means.mean):
             self.store.append(means.mean[:, :3])
-            self.lower, self.upper = np.full(3, np.inf), np.full(3, -np.inf)
-            self._widen(means.mean[:, :3])
+            self.lower, self.upper = means.mean[:, :3].min(axis=0), means.mean[:, :3].max(axis=0)
         if means.repeated:
             self.notes.append(f"{self.rows:,} rows averaged into {len(means.rows):,} positions by label")
 
@@ -264,22 +276,17 @@ class Collector:
             raise DataError(
                 f"{self.source}: holds {few}; turn the sensor between readings, best to twelve poses or more"
             )
-        if self._stuck:
-            raise DataError(
-                f"{self.source}: all {self.store.rows:,} readings are equal, {self._value()}; "
-                "the sensor has to be turned between them"
-            )
+        advice = "; the sensor has to be turned between them"
+        self._refuse_equal(f"all {self.store.rows:,} readings are equal", advice)
 
     def _widen(self, output: Float) -> None:
         self.lower = np.minimum(self.lower, [axis.min() for axis in output.T])
         self.upper = np.maximum(self.upper, [axis.max() for axis in output.T])
 
-    @property
-    def _stuck(self) -> bool:
-        return bool((self.lower == self.upper).all())
-
-    def _value(self) -> str:
-        return "(" + ", ".join(f"{value:g}" for value in self.lower) + ")"
+    def _refuse_equal(self, fault: str, advice: str = "") -> None:
+        if (self.lower == self.upper).all():
+            value = ", ".join(f"{value:g}" for value in self.lower)
+            raise DataError(f"{self.source}: {fault}, ({value}){advice}")
 
 
 class LabelledMeans(Generic[Label]):
@@ -312,12 +319,11 @@ class LabelledMeans(Generic[Label]):
         spread: Float | None = None,
     ) -> None:
         """Add rows (B, width), with weights (B,) and standard deviations (B, 3) in sensor units if known."""
-        index = self.index
-        codes = np.fromiter((index.setdefault(label, len(index)) for label in labels), np.intp, len(labels))
-        self._grow(len(index))
+        codes, size = number_labels(self.index, labels), len(self.index)
+        self._grow(size)
         self.weighted, self.spreads = weight is not None, spread is not None
         weight = np.ones(len(rows)) if weight is None else weight
-        self.rows += np.bincount(codes, minlength=len(index))
+        self.rows += np.bincount(codes, minlength=size)
         self._merge(codes, rows, weight)
         if spread is not None:
             self.spread[codes] = spread
@@ -375,13 +381,75 @@ class LabelledMeans(Generic[Label]):
         return np.where(self.rows[:, None] > 1, pooled, single)
 
 
+def number_labels(index: dict[Label, int], labels: Sequence[Label]) -> Int:
+    """Return the number of each label, shape (B,), by the index, to which a new one is added with the next number."""
+    return np.fromiter((index.setdefault(label, len(index)) for label in labels), np.intp, len(labels))
+
+
+def log_cautions(rows: int, first: Float, span: float, *, timed: bool) -> tuple[str, ...]:
+    """Return a caution for rows that are taken for poses and may be a log: timed, or each much like the one before.
+
+    Args:
+        rows: how many; first: the first of them, shape (B, 3), LOOKED_AT at most.
+        span: the largest range of an axis; timed: whether they have times.
+    """
+    if rows < RAW_ROWS or not (timed or np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) < ALIKE * span):
+        return ()
+    return (
+        f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, find its poses with "
+        "accelcal detect, or calibrate with --raw; of many readings of one pose, label the poses in a column.",
+    )
+
+
+def doubts(output: Float, names: Sequence[str]) -> list[str]:
+    """Return what is doubtful about poses, in sentences.
+
+    Args:
+        output: of the poses, or of many of them, shape (J, 3), sensor units.
+        names: of the three columns.
+    """
+    sentences = [
+        f'Column "{name}" is {output[0, i]:g} in every pose: its axis is dead or was never turned.'
+        for i, name in enumerate(names)
+        if (output[:, i] == output[0, i]).all()
+    ]
+    sentences += [
+        f'Columns "{names[i]}" and "{names[j]}" are equal in every pose: they show one axis.'
+        for i, j in PAIRS
+        if (output[:, i] == output[:, j]).all()
+    ]
+    copies = len(output) - len({row.tobytes() for row in output})
+    if copies >= MANY_COPIES * len(output):
+        sentences.append(
+            f"{copies:,} of {len(output):,} poses repeat another to the last digit. Sigma counts them as independent "
+            "measurements: leave copies out."
+        )
+    return sentences
+
+
+def may_be_doubtful(output: Float, poses: Int) -> Bool:
+    """Return which of R sensors to ask `doubts` about, shape (R,): all of those of which it has something to say.
+
+    Args:
+        output: their poses, shape (R, J, 3), whatever follows the last; poses: of each, shape (R,).
+    """
+    real = np.arange(output.shape[1]) < poses[:, None]
+    dead = ((output == output[:, :1]) | ~real[..., None]).all(axis=1).any(axis=1)
+    axes = np.moveaxis(output, 2, 0)
+    equal = [((axes[i] == axes[j]) | ~real).all(axis=1) for i, j in PAIRS]
+    # Mixed into one number, rows that are equal stay equal; NaN comes last.
+    mixed = np.sort(np.where(real, axes[0] + np.pi * axes[1] + np.e * axes[2], np.nan), axis=1)
+    copies = (mixed[:, 1:] == mixed[:, :-1]).sum(axis=1)
+    many = copies >= MANY_COPIES * np.minimum(poses, LOOKED_AT)
+    return np.asarray(dead | np.logical_or.reduce(equal) | many)
+
+
 def _sums(codes: Int, values: Float, size: int) -> Float:
     return np.bincount(codes, weights=values, minlength=size).astype(np.float64, copy=False)
 
 
 def _are_no_counts(count: Float) -> Bool:
-    bad: Bool = (count < 1) | (count != np.round(count))
-    return bad
+    return np.asarray((count < 1) | (count != np.round(count)))
 
 
 def _array(what: str, values: ArrayLike, width: int, rows: int | None = None, *, gaps: bool = False) -> Float:

@@ -112,12 +112,11 @@ class _LineWriter:
             frame = pl.read_csv(block, has_header=False, schema=schema, quote_char=None, separator=split)
         except pl.exceptions.PolarsError:
             return False
-        if len(frame) != len(values):  # comments, or blank lines
-            return False
         left_over = (
             separator != " " and not self.change.places and frame["old 0"].str.ends_with(separator).any()
         )
-        if left_over and not self._regular(block, len(values)):
+        odd = len(frame) != len(values)  # comments, or blank lines
+        if odd or (left_over and not self._regular(block, len(values))):
             return False
         new = [pl.Series(f"new {k}", column) for k, column in enumerate(values.T)]
         file.flush()
@@ -165,8 +164,7 @@ class _LineWriter:
         if self.titled or names != list(self.dialect.names or ()):
             return line
         self.titled = True
-        start = len(line) - len(body)
-        return line[:start] + self._changed(body, [name.encode() for name in self.change.names])
+        return line.removesuffix(body) + self._changed(body, [name.encode() for name in self.change.names])
 
     def _changed(self, line: bytes, cells: Sequence[bytes]) -> bytes:
         """Return a line with the first new cells in their places and the others at its end."""

@@ -91,12 +91,10 @@ def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Ite
         if not text or text.startswith("#"):
             continue
         reading = pick(text, columns)
+        unread = 0 if reading is not None else unread + 1
         if reading is not None:
-            unread = 0
             yield reading
-            continue
-        unread += 1
-        if unread == PATIENCE:
+        elif unread == PATIENCE:
             raise DataError(
                 f"{source}: {PATIENCE} lines in a row without {max(columns) + 1} numbers, as "
                 f'"{text[:SHOWN]}"; are --columns and --baud right?'
@@ -106,10 +104,8 @@ def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Ite
 def pick(line: str, columns: Sequence[int]) -> Float | None:
     """Return three numbers of a line, counted from 0, shape (3,); None when one is missing or not finite."""
     values = numbers(line)
-    if len(values) <= max(columns):
-        return None
-    chosen = [values[column] for column in columns]
-    return np.array(chosen) if all(map(math.isfinite, chosen)) else None
+    chosen = [values[column] for column in columns if column < len(values)]
+    return np.array(chosen) if len(chosen) == len(columns) and all(map(math.isfinite, chosen)) else None
 
 
 def numbers(line: str) -> list[float]:

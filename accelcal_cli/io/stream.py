@@ -13,6 +13,7 @@ import sys
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 from typing import BinaryIO
@@ -181,6 +182,36 @@ def _neighbour(path: Path) -> str:
     return did_you_mean(path.name, names)
 
 
+@dataclass(eq=False)
+class BackgroundThread:
+    """Runs calls in order, one at a time, while the caller goes on."""
+
+    _thread: Thread | None = None  # None while idle
+    _fault: BaseException | None = None
+
+    def start(self, call: Callable[[], object]) -> None:
+        """Wait for the running call, then start the next one."""
+        self.wait()
+        self._thread = Thread(target=self._run, args=(call,), daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Wait for the running call; raise what it raised."""
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._fault is not None:
+            fault, self._fault = self._fault, None
+            raise fault
+
+    def _run(self, call: Callable[[], object]) -> None:
+        try:
+            call()
+        except BaseException as fault:
+            self._fault = fault
+
+
+@dataclass(eq=False, repr=False)
 class RowStore:
     """Rows of `width` numbers, appended once and read back in blocks as often as needed.
 
@@ -188,14 +219,12 @@ class RowStore:
     it is read with ordinary reads, because mapped pages would count as the process's own.
     """
 
-    def __init__(self, width: int = 3, limit: int = IN_MEMORY) -> None:
-        """Keep up to `limit` rows in memory."""
-        self.rows = 0
-        self.width = width
-        self._limit = limit
-        self._parts: list[Float] = []
-        self._file: BinaryIO | None = None
-        self._writing = BackgroundThread()
+    width: int = 3
+    limit: int = IN_MEMORY  # rows that stay in memory
+    rows: int = field(default=0, init=False)
+    _parts: list[Float] = field(default_factory=list, init=False)
+    _file: BinaryIO | None = field(default=None, init=False)
+    _writing: BackgroundThread = field(default_factory=BackgroundThread, init=False)
 
     def append(self, rows: Float) -> None:
         """Add rows (B, width)."""
@@ -203,7 +232,7 @@ class RowStore:
             return
         self._parts.append(np.array(rows, dtype=np.float64, order="C"))
         self.rows += len(rows)
-        if self.rows > self._limit:
+        if self.rows > self.limit:
             parts, self._parts = self._parts, []
             with _named_disk_errors():
                 self._writing.start(lambda: self._spill(parts))
@@ -227,9 +256,7 @@ class RowStore:
     def all(self) -> Float:
         """Every row, (rows, width)."""
         self._settle()
-        if self._file is None:
-            return self._in_memory()
-        return np.concatenate([block for _, block in self.blocks()])
+        return self._in_memory() if self._file is None else np.concatenate([b for _, b in self.blocks()])
 
     def _in_memory(self) -> Float:
         if len(self._parts) != 1:
@@ -265,33 +292,3 @@ def _named_disk_errors() -> Iterator[None]:
             f"{gettempdir()}: the temporary file for more than {IN_MEMORY:,} readings failed "
             f"({problem.strerror or problem}); free some space, or set TMPDIR to a larger folder"
         ) from problem
-
-
-class BackgroundThread:
-    """Runs calls in order, one at a time, while the caller goes on."""
-
-    def __init__(self) -> None:
-        """Start idle."""
-        self._thread: Thread | None = None
-        self._fault: BaseException | None = None
-
-    def start(self, call: Callable[[], object]) -> None:
-        """Wait for the running call, then start the next one."""
-        self.wait()
-        self._thread = Thread(target=self._run, args=(call,), daemon=True)
-        self._thread.start()
-
-    def wait(self) -> None:
-        """Wait for the running call; raise what it raised."""
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        if self._fault is not None:
-            fault, self._fault = self._fault, None
-            raise fault
-
-    def _run(self, call: Callable[[], object]) -> None:
-        try:
-            call()
-        except BaseException as fault:
-            self._fault = fault

@@ -97,10 +97,9 @@ def minimize(
     parts = []
     for first in range(0, len(numbers), size):
         block = np.arange(first, min(first + size, len(numbers)))
-        x = None if start is None else start[block]
         loop = _Loop(problem.take(block) if size < len(numbers) else problem, optimizer, stopping, trace)
         with np.errstate(all="ignore"):
-            parts.append(loop.run(numbers[block], seed, x))
+            parts.append(loop.run(numbers[block], seed, None if start is None else start[block]))
         if progress:
             progress(int(block[-1]) + 1, len(numbers))
     return parts[0] if len(parts) == 1 else _join(parts)
@@ -156,12 +155,12 @@ class _Loop(Generic[S]):
         if state.status is None and self.endless:
             return state
         reasons = self._reasons(state.status)
-        if not any(ended.any() for _, ended in reasons):
+        over = np.logical_or.reduce([ended for _, ended in reasons])
+        if not over.any():
             return state
         for status, ended in reasons:
             for run in self.alive[ended]:
                 self.status[run] = status
-        over = np.logical_or.reduce([ended for _, ended in reasons])
         self._leave(np.flatnonzero(over), k)
         rest = np.flatnonzero(~over)
         self.alive, self.counted, self.rng = self.alive[rest], self.counted.take(rest), self.rng.take(rest)
@@ -206,8 +205,6 @@ class _Loop(Generic[S]):
 
 def _join(parts: list[Run]) -> Run:
     """Return the outcome of the runs of all parts, their traces as long as the longest."""
-    traces = [part.trace for part in parts if part.trace is not None]
-    counts = [part.trace_evaluations for part in parts if part.trace_evaluations is not None]
     return Run(
         np.concatenate([part.runs for part in parts]),
         np.concatenate([part.x for part in parts]),
@@ -215,12 +212,13 @@ def _join(parts: list[Run]) -> Run:
         np.concatenate([part.evaluations for part in parts]),
         np.concatenate([part.iterations for part in parts]),
         tuple(status for part in parts for status in part.status),
-        np.concatenate(_padded(traces)) if traces else None,
-        np.concatenate(_padded(counts)) if counts else None,
+        _stacked([part.trace for part in parts if part.trace is not None]),
+        _stacked([part.trace_evaluations for part in parts if part.trace_evaluations is not None]),
     )
 
 
-def _padded(traces: list[NDArray[N]]) -> list[NDArray[N]]:
-    """Return arrays of shape (R, K) as wide as the widest, the last value of each row repeated."""
-    longest = max(trace.shape[1] for trace in traces)
-    return [np.pad(trace, ((0, 0), (0, longest - trace.shape[1])), mode="edge") for trace in traces]
+def _stacked(traces: list[NDArray[N]]) -> NDArray[N] | None:
+    """Return the rows of all traces, each with its last value repeated up to the longest; None without traces."""
+    longest = max((trace.shape[1] for trace in traces), default=0)
+    padded = [np.pad(trace, ((0, 0), (0, longest - trace.shape[1])), mode="edge") for trace in traces]
+    return np.concatenate(padded) if padded else None

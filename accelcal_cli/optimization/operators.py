@@ -14,8 +14,7 @@ def gather(x: Float, index: Int) -> Float:
     """Return points of each run's population, x (R, P, D) at index (R, Q): shape (R, Q, D)."""
     flat = x.transpose(0, 2, 1)
     if len(flat) == 1:
-        only: Float = flat.take(index[0], axis=2).transpose(0, 2, 1)
-        return only
+        return np.asarray(flat.take(index[0], axis=2).transpose(0, 2, 1))
     out = np.empty((*flat.shape[:2], index.shape[1]))
     for source, columns, target in zip(flat, index, out, strict=True):
         source.take(columns, axis=1, out=target, mode="clip")  # "raise" would copy once more
@@ -42,10 +41,16 @@ def best_of(x: Float, fx: Float) -> Float:
     return points(x, fx.argmin(axis=1))
 
 
+def moved_to_best(leader: Float, cost: Float, x: Float, fx: Float) -> tuple[Float, Float]:
+    """Return leader (R, 1, D) and its cost (R,), replaced by the best of x (R, P, D) where that costs less."""
+    least = fx.min(axis=1)
+    better = (least < cost)[:, None, None]
+    return np.where(better, best_of(x, fx)[:, None], leader), np.minimum(least, cost)
+
+
 def integers(u: Float, *below: int) -> Int:
     """Return integers, shape (..., C, P), from uniform numbers, shape (..., P, C); column c is in 0 .. below[c] - 1."""
-    whole: Int = (u.swapaxes(-1, -2) * _column(below)).astype(np.intp)
-    return whole
+    return np.asarray((u.swapaxes(-1, -2) * _column(below)).astype(np.intp))
 
 
 @cache

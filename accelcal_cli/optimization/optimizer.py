@@ -21,7 +21,7 @@ from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import Checked, setting
 
 
 class Status(IntEnum):
@@ -73,7 +73,7 @@ def take(state: S, index: Int) -> S:
 
 
 @dataclass(frozen=True)
-class Optimizer(ABC, Generic[S]):
+class Optimizer(Checked, ABC, Generic[S]):
     """Base of all optimizers, generic in their State; the fields of a subclass are its YAML keys."""
 
     name: ClassVar[str]
@@ -96,10 +96,6 @@ class Optimizer(ABC, Generic[S]):
             if not getattr(cls, attribute, None):
                 raise TypeError(f"optimizer class {cls.__name__} lacks {attribute}")
 
-    def __post_init__(self) -> None:
-        """Refuse a setting outside its range."""
-        check(self)
-
     @property
     def points_per_run(self) -> int:
         """Points of one run that a step evaluates, which decides how many runs make a block that fits the cache."""
@@ -116,6 +112,14 @@ class Optimizer(ABC, Generic[S]):
     @abstractmethod
     def step(self, problem: Problem, state: S, rng: Streams) -> S:
         """Return the State after one iteration of all R runs."""
+
+
+class PopulationAlone:
+    """Mixin of an optimizer that carries nothing but the population from step to step."""
+
+    def init(self, problem: Problem, x: Float, rng: Streams) -> State:  # noqa: ARG002
+        """Evaluate the starting population."""
+        return State(x, problem.cost(x))
 
 
 OPTIMIZERS: Registry[Optimizer[State]] = Registry(
@@ -135,5 +139,4 @@ def optimizer_file(name: str) -> Path | None:
 def shipped_parameters(optimizer: object) -> dict[str, Any]:
     """Return the settings that the file of an optimizer states; none for an unknown one."""
     path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
-    parameters: dict[str, Any] = (load_mapping(path).get("parameters") or {}) if path else {}
-    return parameters
+    return dict(load_mapping(path).get("parameters") or {}) if path else {}

@@ -56,9 +56,13 @@ class Problem(ABC):
     @cached_property
     def limits(self) -> tuple[Bound, Bound]:
         """Lower and upper, as two numbers where all coordinates have the same: numpy clips faster by numbers."""
-        if np.ptp(self.lower) == 0 and np.ptp(self.upper) == 0:
-            return float(self.lower[0]), float(self.upper[0])
-        return self.lower, self.upper
+        alike = np.ptp(self.lower) == 0 and np.ptp(self.upper) == 0
+        return (float(self.lower[0]), float(self.upper[0])) if alike else (self.lower, self.upper)
+
+    @property
+    def half_width(self) -> Float:
+        """Half the width of the box, shape (D,)."""
+        return np.asarray(0.5 * (self.upper - self.lower))
 
     @abstractmethod
     def cost(self, x: Float) -> Float:
@@ -184,13 +188,10 @@ class Counted(Problem):
         self.spent += x.shape[1]
         better = least < self.best_cost
         count = np.count_nonzero(better)
-        if not count:
-            return
-        best = points(x, column)
         if count == len(least):
-            self.best_x, self.best_cost = best, least
-        else:
-            self.best_x = np.where(better[:, None], best, self.best_x)
+            self.best_x, self.best_cost = points(x, column), least
+        elif count:
+            self.best_x = np.where(better[:, None], points(x, column), self.best_x)
             self.best_cost = np.minimum(least, self.best_cost)
 
 
@@ -202,10 +203,9 @@ def differences(problem: Problem, x: Float) -> tuple[Float, Float]:
     second difference.
     """
     D = problem.dimensions
-    h = np.finfo(float).eps ** 0.25 * 0.5 * (problem.upper - problem.lower)
+    h = np.finfo(float).eps ** 0.25 * problem.half_width
     x = np.clip(x, problem.lower + 2.0 * h, problem.upper - 2.0 * h)
-    f0 = problem.cost(x)
-    steps = np.diag(h)
+    f0, steps = problem.cost(x), np.diag(h)
     plus = np.stack([problem.cost(x + steps[i]) for i in range(D)], axis=-1)
     minus = np.stack([problem.cost(x - steps[i]) for i in range(D)], axis=-1)
     gradient = (plus - minus) / (2.0 * h)
@@ -225,5 +225,4 @@ def points(x: Float, index: Int) -> Float:
     """Return the point (or cost) of each run's population, (R, P, ...), at its index, (R,): a copy, shape (R, ...)."""
     if len(index) == 1:  # Indexing by one number is several times as fast as by arrays.
         return x[:, index[0]].copy()
-    point: Float = x[np.arange(len(index)), index]
-    return point
+    return np.asarray(x[np.arange(len(index)), index])

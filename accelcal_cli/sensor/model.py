@@ -7,7 +7,8 @@ N is the output (pulse/s, counts, any linear output), f the specific force in th
 A rotation of the body frame changes K_a to K_a R^T and leaves every |f| as it was: readings without known
 attitudes determine K_a only up to that rotation, and a gauge is the convention that chooses it (`to_gauge`).
 
-The engineering units of the parameters stand at the end: scale-factor errors, misalignment angles, bias as force.
+The engineering units of the parameters stand at the end (scale-factor errors, misalignment angles, bias as force), and
+local gravity: stated, or the normal gravity of WGS84 at a latitude and height.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.linalg import cholesky, eigh, inv, qr, svd
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.errors import DataError
+from accelcal_cli.errors import DataError, UsageError
 
 Gauge = Literal["lower", "upper", "symmetric", "full"]
 GAUGES: tuple[str, ...] = get_args(Gauge)
@@ -30,6 +31,9 @@ SQUARABLE = 1e-6
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2, the conventional value of 1 g (CGPM 1901)."""
+
+LEAST_GRAVITY, MOST_GRAVITY = 1e-3, 1e6
+"""Gravity in any unit of acceleration that a sensor is calibrated in: 1 for g, 9.8 for m/s^2, 1000 for mg."""
 
 PPM = 1e6
 MRAD = 1e3
@@ -160,3 +164,37 @@ def check_unit(output: Float, unit: str) -> None:
 
 def _reads_1_g(length: float, unit: str) -> bool:
     return OUTPUT_OF_1_G[unit] / AWAY <= length <= OUTPUT_OF_1_G[unit] * AWAY
+
+
+def check_gravity(g: float) -> float:
+    """Return g, in m/s^2 (or 1 for readings in units of g), or raise UsageError when it cannot be one."""
+    if not LEAST_GRAVITY <= g <= MOST_GRAVITY:
+        raise UsageError(
+            f"--g {g:g}: expected gravity in m/s^2 (9.78 to 9.84 on Earth), or 1 for readings in units of g"
+        )
+    return g
+
+
+def normal_gravity(latitude: float, height: float = 0.0) -> float:
+    """Return the magnitude of WGS84 normal gravity in m/s^2 (Li and Goetze closed form, by boule).
+
+    Args:
+        latitude: geodetic latitude, degrees, -90 to 90.
+        height: height above the ellipsoid, metres.
+
+    Raises:
+        UsageError: latitude or height out of range.
+    """
+    if not -90 <= latitude <= 90:
+        raise UsageError(f"--latitude {latitude:g}: expected degrees from -90 to 90")
+    if not -1e4 <= height <= 1e5:
+        raise UsageError(f"--height {height:g}: expected metres above the ellipsoid, from -10000 to 100000")
+    import warnings
+
+    import boule
+
+    with warnings.catch_warnings():
+        # Below the ellipsoid boule warns; the field of the outside, continued, is that in a valley there.
+        warnings.simplefilter("ignore", UserWarning)
+        milligal = boule.WGS84.normal_gravity((0.0, latitude, height))
+    return float(milligal) * 1e-5

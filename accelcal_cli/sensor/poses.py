@@ -23,11 +23,10 @@ def faces() -> Float:
 
 def edges() -> Float:
     """Return the 12 edge directions (0, +-1, +-1)/sqrt 2 and permutations (a cuboctahedron), shape (12, 3)."""
-    signs = list(itertools.product((1.0, -1.0), repeat=2))
     rows = [
         [a if k == i else b if k == j else 0.0 for k in range(3)]
         for i, j in itertools.combinations(range(3), 2)
-        for a, b in signs
+        for a, b in itertools.product((1.0, -1.0), repeat=2)
     ]
     return np.array(rows) / math.sqrt(2.0)
 
@@ -44,8 +43,7 @@ def grid(most: int) -> Float:
     """
     rows = [t for t in itertools.product(range(-most, most + 1), repeat=3) if math.gcd(*t) == 1]
     whole = np.array(sorted(rows, key=lambda t: (max(map(abs, t)), sum(map(abs, t)))), dtype=float)
-    unit: Float = whole / np.linalg.norm(whole, axis=1, keepdims=True)
-    return unit
+    return np.asarray(whole / np.linalg.norm(whole, axis=1, keepdims=True))
 
 
 def faces_edges() -> Float:
@@ -127,8 +125,7 @@ def directions(count: int, scheme: str | None, random: Float) -> Float:
     if scheme == "fibonacci":
         return fibonacci(count)
     if scheme == "random":
-        unit: Float = random / np.linalg.norm(random, axis=1, keepdims=True)
-        return unit
+        return np.asarray(random / np.linalg.norm(random, axis=1, keepdims=True))
     rows = FIXED[scheme]()
     if len(rows) != count:
         raise UsageError(

@@ -16,7 +16,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.rng import Purpose, Streams
-from accelcal_cli.schema import check, from_mapping, setting
+from accelcal_cli.schema import Checked, from_mapping, setting
 from accelcal_cli.sensor.model import ErrorModel
 
 HOLD_SPREAD = 0.2
@@ -38,20 +38,16 @@ Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Spread:
+class Spread(Checked):
     """How sensors of one type differ: one sigma of their errors."""
 
     scale: float = setting(0.0, "scale factor, part of nominal", low=0, high=0.2)
     misalignment: float = setting(0.0, "misalignment, rad", low=0, high=0.2)
     bias: float = setting(0.0, "bias, m/s^2", low=0, high=50)
 
-    def __post_init__(self) -> None:
-        """Raise ConfigError for a spread outside its range."""
-        check(self)
-
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Checked):
     """A sensor configuration: its true errors, its noise, and how its type spreads."""
 
     name: str = setting("", "what it is")
@@ -64,7 +60,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         """Raise ConfigError for a sensor without an invertible matrix."""
-        check(self)
+        super().__post_init__()
         if self.K_a is None:
             raise ConfigError("K_a: missing; expected three rows of three numbers")
         if not np.isfinite(self.K_a).all() or abs(np.linalg.det(np.array(self.K_a))) == 0:
@@ -150,17 +146,13 @@ def simulate_fleet(
 
 
 @dataclass(frozen=True)
-class Handling:
+class Handling(Checked):
     """How the sensor is held and moved."""
 
     rate: float = setting(100.0, "rows per second, Hz", low=1, high=1e5)
     hold: float = setting(5.0, "seconds that a pose is held, within a fifth", above=0, high=1e5)
     move: float = setting(2.0, "seconds of a move", above=0, high=1e5)
     tremor: float = setting(0.0, "trembling of a hand that holds it, m/s^2 rms", low=0, high=10)
-
-    def __post_init__(self) -> None:
-        """Raise ConfigError for a value outside its range."""
-        check(self)
 
 
 @dataclass(frozen=True)

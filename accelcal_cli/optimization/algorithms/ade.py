@@ -18,7 +18,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.optimization.operators import best_of, better_of, gather, integers, partners
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, PopulationAlone, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -29,7 +29,7 @@ LAMBDA = 1e-13
 
 @OPTIMIZERS.register("ade")
 @dataclass(frozen=True)
-class AdaptiveEvolution(Optimizer[State]):
+class AdaptiveEvolution(PopulationAlone, Optimizer[State]):
     """Adaptive differential evolution of the DE-PF paper."""
 
     family = "evolution"
@@ -43,10 +43,6 @@ class AdaptiveEvolution(Optimizer[State]):
         "current-to-best",
         "best-r: m + F (best - m_r) as the paper's text reads; current-to-best: m + F (best - m) + F (m_r1 - m_r2)",
     )
-
-    def init(self, problem: Problem, x: Float, rng: Streams) -> State:
-        """Evaluate the starting population."""
-        return State(x, problem.cost(x))
 
     def step(self, problem: Problem, state: State, rng: Streams) -> State:
         """Make one generation: mutants, their costs, trials, selection; two evaluations an individual."""
@@ -62,20 +58,17 @@ class AdaptiveEvolution(Optimizer[State]):
         gene = (u[..., 2] * dimensions).astype(np.intp)
         take = (u[..., 3:] <= CR[..., None]) | (gene[..., None] == np.arange(dimensions))
         trial = np.where(take, mutant, x)  # [depf2015] eq. 5
-        trial_cost = problem.cost(trial)
-        return State(*better_of(x, fx, trial, trial_cost))  # [depf2015] eq. 7
+        return State(*better_of(x, fx, trial, problem.cost(trial)))  # [depf2015] eq. 7
 
     def _mutants(self, x: Float, fx: Float, F: Float, u: Float) -> Float:
         """Return the mutants, [depf2015] eq. 3."""
-        population = x.shape[1]
         towards = best_of(x, fx)[:, None] - x
-        first, second = partners(integers(u, population - 1, population - 2))
+        first, second = partners(integers(u, x.shape[1] - 1, x.shape[1] - 2))
         if self.mutation == "best-r":
             towards = towards + x - gather(x, first)
         else:
             towards += gather(x, first) - gather(x, second)
-        mutants: Float = x + F * towards
-        return mutants
+        return np.asarray(x + F * towards)
 
 
 def _distance(cost: Float, fx: Float) -> Float:

@@ -16,21 +16,18 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.optimization.algorithms.pso import SwarmState
 from accelcal_cli.optimization.operators import best_of, better_of
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanState(State):
-    """A swarm with its filters; x is the filtered position."""
+class KalmanState(SwarmState):
+    """A swarm with its filters: x and velocity are filtered, memory is the paper's p, leader its g."""
 
-    velocity: Float  # filtered, (R, P, D)
-    memory: Float  # p, (R, P, D)
-    memory_cost: Float  # (R, P)
-    leader: Float  # g, (R, D)
     covariance: Float  # of (x, v, p, g) or (x, v), (R, k, k, P, D)
 
 
@@ -56,10 +53,8 @@ class AdaptiveKalmanSwarm(Optimizer[KalmanState]):
     def init(self, problem: Problem, x: Float, rng: Streams) -> KalmanState:
         """Scatter positions and velocities; every filter starts with the same covariance."""
         runs, population, dimensions = x.shape
-        limit = self._limit(problem)
-        v = limit * (2.0 * rng.uniform(population, dimensions) - 1.0)
-        fx = problem.cost(x)
-        k = self.kalman_dim
+        v = self.speed * problem.half_width * (2.0 * rng.uniform(population, dimensions) - 1.0)
+        fx, k = problem.cost(x), self.kalman_dim
         P = np.zeros((runs, k, k, dimensions, population)).swapaxes(-1, -2)
         P[:, range(k), range(k)] = self.noise
         return KalmanState(x, fx, v, x, fx, best_of(x, fx), P)
@@ -71,7 +66,7 @@ class AdaptiveKalmanSwarm(Optimizer[KalmanState]):
         u = rng.uniform(population, 4 * dimensions)
         r1, r2, r1_fresh, r2_fresh = (u[..., k * dimensions : (k + 1) * dimensions] for k in range(4))
         phi1, phi2 = self.social * r1, self.cognitive * r2
-        limit = self._limit(problem)
+        limit = self.speed * problem.half_width
         to_leader, to_memory = state.leader[:, None] - x, state.memory - x
         v_predicted = self.inertia * v + phi1 * to_leader + phi2 * to_memory  # eq. 16: X = Phi X
         x_predicted = x + v_predicted
@@ -114,7 +109,3 @@ class AdaptiveKalmanSwarm(Optimizer[KalmanState]):
         x, v = P[:, :, 0], P[:, :, 1]
         a, b, d = a[:, None], b[:, None], d[:, None]
         return np.stack((x * d - v * b, v * a - x * b), axis=2) / determinant[:, None, None]
-
-    def _limit(self, problem: Problem) -> Float:
-        limit: Float = 0.5 * self.speed * (problem.upper - problem.lower)
-        return limit

@@ -20,7 +20,7 @@ from accelcal_cli.optimization.operators import (
     mutated_genes,
     partners,
 )
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, PopulationAlone, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -28,7 +28,7 @@ from accelcal_cli.schema import setting
 
 @OPTIMIZERS.register("de")
 @dataclass(frozen=True)
-class DifferentialEvolution(Optimizer[State]):
+class DifferentialEvolution(PopulationAlone, Optimizer[State]):
     """Differential evolution with greedy selection."""
 
     family = "evolution"
@@ -43,10 +43,6 @@ class DifferentialEvolution(Optimizer[State]):
         "parent",
         "what the crossover probability keeps: parent as in the DPSO paper, mutant as in Storn and Price",
     )
-
-    def init(self, problem: Problem, x: Float, rng: Streams) -> State:
-        """Evaluate the starting population."""
-        return State(x, problem.cost(x))
 
     def step(self, problem: Problem, state: State, rng: Streams) -> State:
         """Make one generation, all trials from the old population."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.optimization.algorithms.pso import velocity
+from accelcal_cli.optimization.algorithms.pso import SwarmState, velocity
 from accelcal_cli.optimization.operators import (
     best_of,
     better_of,
@@ -23,20 +23,20 @@ from accelcal_cli.optimization.operators import (
     mutated_genes,
     partners,
 )
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 
 
 @dataclass(frozen=True, eq=False)
-class HybridState(State):
-    """Both halves, the swarm first: x and fx are the points of the last evaluation, positions and trials."""
+class HybridState(SwarmState):
+    """Both halves, the swarm first: x and fx are the points of the last evaluation, positions and trials.
 
-    velocity: Float  # (R, P/2, D)
-    memory: Float  # pbest, then the evolving individuals: what only a better point replaces, (R, P, D)
-    memory_cost: Float  # (R, P)
-    leader: Float  # common best, (R, D)
+    Only the swarm has a velocity, shape (R, P/2, D). The memory is pbest, then the evolving individuals: what only a
+    better point replaces. The leader is the common best.
+    """
+
     iteration: int
 
 
@@ -76,8 +76,9 @@ class HybridSwarm(Optimizer[HybridState]):
         x, v = self._moved(problem, state, rng)
         fx = problem.cost(x)
         memory, memory_cost = better_of(state.memory, state.memory_cost, x, fx)  # [dpso2014] eq. 6
-        leader = best_of(memory, memory_cost)
-        return HybridState(x, fx, v, memory, memory_cost, leader, state.iteration + 1)
+        return HybridState(
+            x, fx, v, memory, memory_cost, best_of(memory, memory_cost), iteration=state.iteration + 1
+        )
 
     def _moved(self, problem: Problem, state: HybridState, rng: Streams) -> tuple[Float, Float]:
         """Return both halves' next points and the swarm's velocities."""
@@ -86,7 +87,9 @@ class HybridSwarm(Optimizer[HybridState]):
         x, curve = np.empty_like(state.x), self._curve(state.iteration)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
-        v = self._velocity(state, r1[:, :half], r2[:, :half], curve)
+        inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
+        swarm = (state.x[:, :half], state.velocity, state.memory[:, :half], state.leader)
+        v = velocity(*swarm, r1[:, :half], r2[:, :half], inertia, self.social, self.cognitive)
         clip(v, -limit, limit)
         np.add(state.x[:, :half], v, out=x[:, :half])  # [dpso2014] eq. 2
         individuals = state.memory[:, half:].copy(order="K")
@@ -111,13 +114,6 @@ class HybridSwarm(Optimizer[HybridState]):
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""
         return float(1.0 / (1.0 + self.curve_a * self.curve_b ** (100.0 * iteration / self.iterations)))
-
-    def _velocity(self, state: HybridState, r1: Float, r2: Float, curve: float) -> Float:
-        """Return the swarm's velocities before their limit."""
-        half = state.velocity.shape[1]
-        inertia = self.inertia_max - (self.inertia_max - self.inertia_min) * curve  # [dpso2014] eq. 7
-        x, memory = state.x[:, :half], state.memory[:, :half]
-        return velocity(x, state.velocity, memory, state.leader, r1, r2, inertia, self.social, self.cognitive)
 
     def _change(self, x: Float, leader: Float, picks: Int, curve: float) -> Float:
         """Return what mutation adds to the evolving half.

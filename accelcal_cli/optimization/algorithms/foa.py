@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.optimization.operators import best_of
+from accelcal_cli.optimization.operators import moved_to_best
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
@@ -56,14 +56,11 @@ class FruitFly(Optimizer[PlaneState]):
         flies = state.axis + self.radius * u  # step 2
         candidates = self._candidates(problem, flies, population)
         fx = problem.cost(candidates)  # step 4
-        smell = fx.min(axis=1)  # step 5
-        better = smell < state.smell  # step 6
-        axis = np.where(better[:, None, None], best_of(flies, fx)[:, None], state.axis)
-        return PlaneState(candidates, fx, axis, np.where(better, smell, state.smell))
+        axis, smell = moved_to_best(state.axis, state.smell, flies, fx)  # steps 5 and 6
+        return PlaneState(candidates, fx, axis, smell)
 
     def _candidates(self, problem: Problem, flies: Float, population: int) -> Float:
         """Return S = 1 / sqrt(X^2 + Y^2) in the box, shape (R, P, D) (step 3)."""
-        dimensions = flies.shape[2] // 2
-        distance = np.hypot(flies[..., :dimensions], flies[..., dimensions:])
+        distance = np.hypot(*np.split(flies, 2, axis=2))
         S = np.clip(1.0 / np.maximum(distance, 1e-12), problem.lower, problem.upper)
-        return np.broadcast_to(S, (len(S), population, dimensions))
+        return np.broadcast_to(S, (len(S), population, S.shape[2]))

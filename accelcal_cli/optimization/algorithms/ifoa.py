@@ -18,6 +18,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
+from accelcal_cli.optimization.operators import moved_to_best
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
@@ -77,14 +78,10 @@ class ImprovedFruitFly(Optimizer[FlyState]):
         flies = state.axis + radius * (2.0 * rng.uniform(population, dimensions) - 1.0)  # step 2'
         np.clip(flies, problem.lower, problem.upper, out=flies)  # S = X, step 3'
         fx = problem.cost(flies)
-        column = fx.argmin(axis=1)
-        rows = np.arange(len(fx))
-        better = fx[rows, column] < state.smell
-        axis = np.where(better[:, None, None], flies[rows, column][:, None], state.axis)
+        axis, smell = moved_to_best(state.axis, state.smell, flies, fx)
         # Below the spacing of doubles around the swarm no fly differs from it any more.
         stuck = (radius < np.spacing(np.abs(axis))).all(axis=(1, 2))
         status = np.where(stuck, Status.CONVERGED, Status.RUNNING).astype(np.int8)
-        smell = np.where(better, fx[rows, column], state.smell)
         return FlyState(flies, fx, axis, smell, state.threshold, status=status)
 
     def exponent(self, state: FlyState) -> Float:
@@ -95,17 +92,14 @@ class ImprovedFruitFly(Optimizer[FlyState]):
     def reach(self, problem: Problem) -> Float:
         """Return Delta of every coordinate in the problem's coordinates, shape (1 or R, 1, D)."""
         units = np.atleast_2d(problem.units)
-        delta = self.radius
-        half = 0.5 * (problem.upper - problem.lower)
-        first = np.full((len(units), 1), delta) if delta else PART_OF_BOX * half[:1] * units[:, :1]
+        automatic = PART_OF_BOX * problem.half_width[:1] * units[:, :1]
+        first = np.full((len(units), 1), self.radius) if self.radius else automatic
         scale = np.array(self.radius_scale)[np.minimum(problem.groups, len(self.radius_scale) - 1)]
-        reach: Float = (first * scale / units)[:, None, :]
-        return reach
+        return np.asarray((first * scale / units)[:, None, :])
 
 
 def _middle(fx: Float) -> Float:
     """Return the median cost of each run, shape (R,); a point without a cost counts as the worst that has one."""
     finite = np.isfinite(fx)
     worst = np.where(finite, fx, 0.0).max(axis=1, keepdims=True)
-    middle: Float = np.median(np.where(finite, fx, worst), axis=1)
-    return middle
+    return np.asarray(np.median(np.where(finite, fx, worst), axis=1))

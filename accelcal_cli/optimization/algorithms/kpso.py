@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.optimization.operators import best_of, moved_to_best
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
@@ -48,17 +49,16 @@ class KalmanSwarm(Optimizer[FilterState]):
     def init(self, problem: Problem, x: Float, rng: Streams) -> FilterState:
         """Start at rest."""
         fx = problem.cost(x)
-        column, rows = fx.argmin(axis=1), np.arange(len(fx))
         covariance = np.broadcast_to(self._q() * np.eye(2), (len(x), 2, 2))
-        mean = (x - problem.lower) / _half(problem) - 1.0
+        mean = (x - problem.lower) / problem.half_width - 1.0
         return FilterState(
-            x, fx, mean, np.zeros_like(mean), covariance, x[rows, column][:, None], fx[rows, column]
+            x, fx, mean, np.zeros_like(mean), covariance, best_of(x, fx)[:, None], fx.min(axis=1)
         )
 
     def step(self, problem: Problem, state: FilterState, rng: Streams) -> FilterState:
         """Observe, filter, predict, and sample the next positions."""
         population, dimensions = state.x.shape[1:]
-        half = _half(problem)
+        half = problem.half_width
         pull = 2.0 * rng.uniform(population, 1)
         z = (state.x + pull * (state.leader - state.x) - problem.lower) / half - 1.0
         Pm = F @ state.covariance @ F.T + self._q() * np.eye(2)
@@ -72,23 +72,8 @@ class KalmanSwarm(Optimizer[FilterState]):
         x = problem.lower + half * (mean + rate + spread + 1.0)
         np.clip(x, problem.lower, problem.upper, out=x)
         fx = problem.cost(x)
-        column, rows = fx.argmin(axis=1), np.arange(len(fx))
-        better = fx[rows, column] < state.leader_cost
-        return FilterState(
-            x,
-            fx,
-            mean,
-            rate,
-            P,
-            np.where(better[:, None, None], x[rows, column][:, None], state.leader),
-            np.where(better, fx[rows, column], state.leader_cost),
-        )
+        return FilterState(x, fx, mean, rate, P, *moved_to_best(state.leader, state.leader_cost, x, fx))
 
     def _q(self) -> float:
         """Return the variance epsilon times the range, which is 2 in half-widths of the box."""
         return 2.0 * self.noise
-
-
-def _half(problem: Problem) -> Float:
-    half: Float = 0.5 * (problem.upper - problem.lower)
-    return half

@@ -125,15 +125,13 @@ def _solve(state: DampedState, on_wall: Bool) -> tuple[Float, Bool]:
     # A floor keeps a coordinate without influence (a pose set that says nothing of it) from dividing by zero.
     scale = np.maximum(scale, 1e-12 * scale.max(axis=2, keepdims=True))
     free: Bool = np.logical_not(on_wall)
-    pairs: Bool = free[..., :, None] & free[..., None, :]
-    matrix = state.normal * pairs
-    diagonal = np.where(on_wall, 1.0, np.einsum("rpdd->rpd", matrix) + state.damping[..., None] * scale)
-    index = np.arange(matrix.shape[-1])
-    matrix[..., index, index] = diagonal
+    matrix = state.normal * (free[..., :, None] & free[..., None, :])
+    diagonal = np.einsum("rpdd->rpd", matrix)  # a view
+    diagonal[...] = np.where(on_wall, 1.0, diagonal + state.damping[..., None] * scale)
     usable: Bool = np.logical_and(
         np.isfinite(matrix).all(axis=(2, 3)), np.isfinite(state.gradient).all(axis=2)
     )
-    matrix = np.where(usable[..., None, None], matrix, np.eye(len(index)))
+    matrix = np.where(usable[..., None, None], matrix, np.eye(matrix.shape[-1]))
     right = np.where(on_wall | ~usable[..., None], 0.0, -state.gradient)
     step = _solutions(matrix, right)
     usable &= np.isfinite(step).all(axis=2)

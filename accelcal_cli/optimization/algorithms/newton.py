@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
+from accelcal_cli.arrays import Bool
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, PopulationAlone, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -23,7 +23,7 @@ SINGULAR = 1e-14
 
 @OPTIMIZERS.register("newton")
 @dataclass(frozen=True)
-class Newton(Optimizer[State]):
+class Newton(PopulationAlone, Optimizer[State]):
     """Newton's iteration."""
 
     family = "least squares"
@@ -32,10 +32,6 @@ class Newton(Optimizer[State]):
     population: int = setting(1, "independent starting points", low=1, high=1_000_000)
     iterations: int = setting(100, "steps at most", low=1, high=1_000_000)
     step_tolerance: float = setting(1e-12, "converged: step below this part of the box", low=0, high=1)
-
-    def init(self, problem: Problem, x: Float, rng: Streams) -> State:
-        """Evaluate the starting points."""
-        return State(x, problem.cost(x))
 
     def step(self, problem: Problem, state: State, rng: Streams) -> State:
         """Take one full Newton step at every point."""

@@ -21,7 +21,7 @@ from functools import cache
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.optimization.operators import gather, integers
+from accelcal_cli.optimization.operators import best_of, gather, integers
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
@@ -199,20 +199,18 @@ class ShadeCma(Optimizer[ShadeState | CmaState]):
         if size >= state.x.shape[1]:
             return state
         keep = np.argsort(state.fx, axis=1, kind="stable")[:, :size]
-        limit = int(self.archive * size)
         return replace(
             state,
             x=gather(state.x, keep),
             fx=np.take_along_axis(state.fx, keep, axis=1),
-            archived=np.minimum(state.archived, limit),
+            archived=np.minimum(state.archived, int(self.archive * size)),
         )
 
 
 def _lehmer(w: Float, values: Float) -> Float:
     """Return the weighted Lehmer mean, shape (k,), of values (k, P) with weights w (k, P); 0 when all are 0."""
     below = np.add.reduce(w * values, axis=1)
-    mean: Float = np.add.reduce(w * values**2, axis=1) / np.where(below > 0, below, 1.0)
-    return mean
+    return np.asarray(np.add.reduce(w * values**2, axis=1) / np.where(below > 0, below, 1.0))
 
 
 @dataclass(frozen=True)
@@ -256,7 +254,7 @@ def _cma_start(x: Float, fx: Float, samples: int, used: int) -> CmaState:
     root of that mean variance.
     """
     runs, _, D = x.shape
-    best = x[np.arange(runs), fx.argmin(axis=1)]
+    best = best_of(x, fx)
     centred = x - x.mean(axis=1, keepdims=True)
     covariance = centred.swapaxes(1, 2) @ centred / x.shape[1]
     variance = np.maximum(np.einsum("rdd->r", covariance) / D, SMALLEST_SIGMA)
@@ -309,8 +307,7 @@ def _cma_step(problem: Problem, state: CmaState, rng: Streams, budget: int) -> C
 
 def _sample(problem: Problem, state: CmaState, rng: Streams) -> tuple[Float, Float]:
     """Return new points, clipped to the box, and their steps from the mean over sigma, shapes (R, P, D)."""
-    z = rng.normal(*state.x.shape[1:])
-    y = (z * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
+    y = (rng.normal(*state.x.shape[1:]) * state.lengths[:, None]) @ state.axes.swapaxes(1, 2)  # eq. 39
     mean, sigma = state.mean[:, None], state.sigma[:, None, None]
     sample = mean + sigma * y  # eq. 40
     x = np.clip(sample, *problem.limits)
@@ -328,15 +325,13 @@ def _step_size(problem: Problem, sigma: Float, length: Float, ranked: Float, k: 
     # The best 70 % of samples cost the same: no direction to go, so the step has to grow.
     flat = ranked[:, 0] == ranked[:, math.ceil(0.7 * ranked.shape[1]) - 1]
     sigma = np.where(flat, sigma * math.exp(0.2 + k.c_sigma / k.d_sigma), sigma)
-    least: Float = np.minimum(sigma, (problem.upper - problem.lower).max())
-    return least
+    return np.asarray(np.minimum(sigma, (problem.upper - problem.lower).max()))
 
 
 def _whiten(state: CmaState, y: Float) -> Float:
     """Return C^(-1/2) y, shape (R, D)."""
     turned = np.einsum("rij,ri->rj", state.axes, y) / np.maximum(state.lengths, SMALLEST_SIGMA)
-    white: Float = np.einsum("rij,rj->ri", state.axes, turned)
-    return white
+    return np.asarray(np.einsum("rij,rj->ri", state.axes, turned))
 
 
 def _adapt(C: Float, path: Float, steps: Float, short: Float, k: _Constants) -> Float:
@@ -346,5 +341,4 @@ def _adapt(C: Float, path: Float, steps: Float, short: Float, k: _Constants) -> 
     rank_one = path[:, :, None] * path[:, None, :]
     rank_mu = (steps * k.weights[:, None]).swapaxes(1, 2) @ steps
     C = decay * C + k.c_1 * rank_one + k.c_mu * rank_mu
-    symmetric: Float = 0.5 * (C + C.swapaxes(1, 2))
-    return symmetric
+    return np.asarray(0.5 * (C + C.swapaxes(1, 2)))
