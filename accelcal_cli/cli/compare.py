@@ -147,7 +147,8 @@ def command(
     from accelcal_cli.studies.compare import Comparison
     from accelcal_cli.studies.scenarios import SearchSpace
     from accelcal_cli.studies.study import Budget, choose, median_curves, words
-    from accelcal_cli.views import studies as views
+    from accelcal_cli.views import experiments
+    from accelcal_cli.views.studies import study_blocks
 
     sensor = simulation.sensor
     type_file = sensor if sensor is not None and Path(sensor).suffix else None
@@ -171,13 +172,13 @@ def command(
         source = simulation.scenario()
     study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
     records = study_options.run(study)
-    title, conditions = views.comparison_subject(study), views.comparison_conditions(study)
-    rows, curves = views.comparison_table(study, records), median_curves(study, records)[""]
+    title, conditions = experiments.comparison_subject(study), experiments.comparison_conditions(study)
+    rows, curves = experiments.comparison_table(study, records), median_curves(study, records)[""]
     shown = {"Convergence": curves} if curves else {}
     options.print_result(
         format,
         lambda: rows,
-        lambda: views.study_blocks(title, [replace(rows.filled(), title="")], shown, conditions),
+        lambda: study_blocks(title, [replace(rows.filled(), title="")], shown, conditions),
     )
     running.draw_convergence(plot, title, {conditions: curves}, 0.0 if study.noisy else study.tolerance)
     options.tell_written([study_options.raw, plot], study_options.quiet)

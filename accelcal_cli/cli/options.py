@@ -25,8 +25,7 @@ from accelcal_cli.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
-    from accelcal_cli.table import Table
-    from accelcal_cli.views.blocks import Block
+    from accelcal_cli.views.blocks import Block, Table
 
 Complete = Callable[[str], list[str]]
 """What the shell asks for values: from what is typed so far to what it may become."""

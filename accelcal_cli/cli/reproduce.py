@@ -14,8 +14,7 @@ from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.reproduce import Experiment
-    from accelcal_cli.table import Table
-    from accelcal_cli.views.blocks import Block
+    from accelcal_cli.views.blocks import Block, Table
 
 
 def command(
@@ -46,7 +45,7 @@ def command(
     docs/explanation/reproduction.md.
     """
     from accelcal_cli.studies import reproduce
-    from accelcal_cli.views.studies import experiment_catalogue
+    from accelcal_cli.views.experiments import experiment_catalogue
 
     if name is None:
         if any(value is not None for value in (study_options.raw, plot, study_options.cluster, runs, seed)):
@@ -67,7 +66,8 @@ def _experiment(
 ) -> None:
     """Run an experiment on optimizers and print it beside the paper's numbers."""
     from accelcal_cli.studies.reproduce import curves
-    from accelcal_cli.views.studies import experiment_tables, study_blocks
+    from accelcal_cli.views.experiments import experiment_tables
+    from accelcal_cli.views.studies import study_blocks
 
     records = study_options.run(experiment)
     results = experiment_tables(experiment, records)

@@ -19,8 +19,7 @@ from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 
-from accelcal_cli.table import Table
-from accelcal_cli.views.blocks import Block, Conclusion, Convergence, Paragraph
+from accelcal_cli.views.blocks import Block, Conclusion, Convergence, Paragraph, Table
 
 PIPE_WIDTH = 160
 """Columns of a table that goes into a pipe or a file, where no terminal sets a limit."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.schema import to_mapping
-from accelcal_cli.table import Table
+from accelcal_cli.views.blocks import Table
 
 if TYPE_CHECKING:
     import polars

@@ -18,7 +18,7 @@ from accelcal_cli.detection.detect import Detection
 from accelcal_cli.navigation.study import BOUND, INS
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.studies.study import Curves
-from accelcal_cli.table import Table
+from accelcal_cli.views.blocks import Table
 from accelcal_cli.views.navigation import Chart
 
 if TYPE_CHECKING:

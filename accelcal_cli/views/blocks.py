@@ -6,10 +6,74 @@ The views of each kind of result return such blocks in reading order; `output.co
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.table import Table
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a Table.
+
+    Attributes:
+        name: heading.
+        unit: unit shown under or behind the heading; empty when it has none.
+        format: format specification of a numeric cell, as in `format(value, spec)`.
+        key: name of the column in machine-readable output; the heading when not given.
+        beside: it belongs to the column before it; a table that is too wide is not cut between them.
+    """
+
+    name: str
+    unit: str = ""
+    format: str = ""
+    key: str = ""
+    beside: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name of the column in machine-readable output."""
+        return self.key or self.name
+
+    def text(self, value: Any) -> str:
+        """Return the cell as a person reads it; a missing value is a dash."""
+        if value is None or value != value:
+            return "-"
+        return format(value, "" if isinstance(value, str) else self.format)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns and rows with a title; `notes` are sentences under it.
+
+    Attributes:
+        title: what the table shows.
+        columns: its columns, in order.
+        rows: one sequence of raw values per row, as long as `columns`.
+        notes: plain sentences that belong under the table.
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Sequence[Any], ...]
+    notes: tuple[str, ...] = ()
+
+    def records(self) -> list[Mapping[str, Any]]:
+        """Return the rows as mappings from column key to raw value."""
+        keys = [column.label for column in self.columns]
+        return [dict(zip(keys, row, strict=True)) for row in self.rows]
+
+    def filled(self) -> Table:
+        """Return the table without the columns that are empty in every row."""
+        return self.with_columns(
+            i for i in range(len(self.columns)) if any(row[i] not in (None, "") for row in self.rows)
+        )
+
+    def with_columns(self, numbers: Iterable[int]) -> Table:
+        """Return the table with the columns of these numbers, from 0, alone."""
+        keep = list(numbers)
+        rows = tuple([row[i] for i in keep] for row in self.rows)
+        return replace(self, columns=tuple(self.columns[i] for i in keep), rows=rows)
 
 
 @dataclass(frozen=True)

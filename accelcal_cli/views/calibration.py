@@ -11,8 +11,7 @@ from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, PARAMETER
 from accelcal_cli.calibration.result import Calibration, Temperature
 from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.poses import AXES
-from accelcal_cli.table import Column, Table
-from accelcal_cli.views.blocks import BLANK, Block, Conclusion, Convergence, notes
+from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Convergence, Table, notes
 
 KINDS = (
     ("scale", SCALE, "ppm", units.PPM),

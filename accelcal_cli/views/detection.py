@@ -11,8 +11,7 @@ import numpy as np
 from accelcal_cli.detection.detect import Detection
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
-from accelcal_cli.table import Column, Table
-from accelcal_cli.views.blocks import Block, notes
+from accelcal_cli.views.blocks import Block, Column, Table, notes
 
 SCHEMA = "accelcal/detection/1"
 """Name and version of the record."""

@@ -10,8 +10,7 @@ import numpy as np
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.fleet import FAILED, Fleet, Quantity, Standout, noise, parameters
 from accelcal_cli.calibration.observability import PARAMETERS
-from accelcal_cli.table import Column, Table
-from accelcal_cli.views.blocks import BLANK, Block, Paragraph
+from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table
 
 SHOWN = 10
 """Sensors of one kind that the summary names."""

@@ -10,7 +10,7 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.navigation.study import Navigation, NavigationSettings, axis_of, rmse_curves, statistics
 from accelcal_cli.studies.study import Record, Row, records_of_cell
-from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import Column, Table
 from accelcal_cli.views.studies import table_of
 
 COLUMNS = (

@@ -8,8 +8,7 @@ from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED
 from accelcal_cli.planning import Plan
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.poses import describe
-from accelcal_cli.table import Column, Table
-from accelcal_cli.views.blocks import BLANK, Block, Conclusion
+from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Table
 from accelcal_cli.views.calibration import KINDS
 
 SHORT = {"scale": "scale", "misalignment": "misal.", "bias": "bias"}

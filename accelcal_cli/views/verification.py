@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.sensor import model as units
-from accelcal_cli.table import Column, Table
 from accelcal_cli.verification import Difference, Verification
-from accelcal_cli.views.blocks import BLANK, Block, Conclusion
+from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Table
 
 UNITS = ((-units.PPM, "ppm"), (-1000.0 * units.MRAD, "micro-rad"), (units.MICRO_G, "micro-g"))
 """Of scale factors, misalignments and biases; those of the inverse matrix change sign, so that they are of K_a."""

@@ -21,7 +21,7 @@ from accelcal_cli.navigation.particle_filter import FILTERS
 from accelcal_cli.navigation.scenario import from_recording, read_voyage
 from accelcal_cli.navigation.study import NavigationSettings, load_study
 from accelcal_cli.navigation.voyage import PlannedVoyage
-from accelcal_cli.table import Table
+from accelcal_cli.views.blocks import Table
 from accelcal_cli.views.navigation import COLUMNS, with_paper
 
 ROOT = Path(accelcal_cli.__file__).parents[1]

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from accelcal_cli.output.console import draw_curve, draw_curves, show
-from accelcal_cli.table import Column, Table
-from accelcal_cli.views.blocks import BLANK, Conclusion, Convergence, Paragraph, notes
+from accelcal_cli.views.blocks import BLANK, Column, Conclusion, Convergence, Paragraph, Table, notes
 
 TABLE = Table(
     "Sensors",

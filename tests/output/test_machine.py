@@ -9,7 +9,7 @@ import math
 import pytest
 
 from accelcal_cli.output.machine import file_name, json_rows, write_csv, write_table
-from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import Column, Table
 
 TABLE = Table(
     "T",

@@ -24,7 +24,7 @@ from accelcal_cli.studies.scenarios import (
     success_limit,
 )
 from accelcal_cli.studies.study import Entry, median_curves
-from accelcal_cli.views.studies import comparison_table
+from accelcal_cli.views.experiments import comparison_table
 
 G = 9.80665
 CONTRACT = {

@@ -13,8 +13,9 @@ from accelcal_cli.studies.compare import error_parts, estimates
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.reproduce import PaperTable, Part
 from accelcal_cli.studies.study import Entry, Task
-from accelcal_cli.table import Column, Table
-from accelcal_cli.views.studies import experiment_tables, parameter_table, raw_table, with_paper_rows
+from accelcal_cli.views.blocks import Column, Table
+from accelcal_cli.views.experiments import experiment_tables, parameter_table, with_paper_rows
+from accelcal_cli.views.studies import raw_table
 
 NAMES = [
     "akpso-calibration", "dpso-figure2", "dpso-table2", "dpso-table3", "ifoa-calibration", "ifoa-rosenbrock",

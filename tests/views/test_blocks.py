@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from accelcal_cli.table import Column, Table
+from accelcal_cli.views.blocks import Column, Table
 
 
 @pytest.mark.parametrize(
