@@ -10,7 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.observability import PRIOR, Observability, _score, design, knowing, next_poses
+from accelcal_cli.calibration.observability import (
+    PRIOR,
+    Observability,
+    design,
+    knowing,
+    next_poses,
+    pose_score,
+)
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.sensor.poses import fixture_directions, grid
@@ -109,7 +116,7 @@ def best_poses(information: Float, candidates: Float, count: int) -> list[int]:
         chosen = start
         for power in POWERS:
             chosen = _exchange(information, rows, chosen, power)
-        reached = float(_score(_variances(information, rows[chosen]), np.inf))
+        reached = float(pose_score(_variances(information, rows[chosen]), np.inf))
         if reached < least:
             kept, least = chosen, reached
     return [int(kept[i]) for i in next_poses_of(information, candidates[kept])]
@@ -144,14 +151,14 @@ def next_poses_of(information: Float, directions: Float) -> list[int]:
 def _exchange(information: Float, rows: Float, start: Int, power: float) -> Int:
     """Return the poses after exchanging one for a better one until no exchange helps."""
     chosen = start.copy()
-    score = float(_score(_variances(information, rows[chosen]), power))
+    score = float(pose_score(_variances(information, rows[chosen]), power))
     moved = True
     while moved:
         moved = False
         for k in range(len(chosen)):
             others = rows[np.delete(chosen, k)]
             after = _variances_with(information + others.T @ others, rows)
-            scores = _score(after, power)
+            scores = pose_score(after, power)
             best = int(np.argmin(scores))
             if scores[best] < score:
                 chosen[k], score, moved = best, float(scores[best]), True

@@ -35,7 +35,7 @@ TILT = ("roll", "pitch", "sigma_roll", "sigma_pitch")
 
 
 @dataclass(frozen=True)
-class Wish:
+class ColumnOptions:
     """What to write.
 
     Attributes:
@@ -69,22 +69,22 @@ class Wish:
         return (*(self.prefix + axis for axis in AXES), *(TILT if self.tilt else ()))
 
 
-class Formula:
+class Correction:
     """New columns from readings, and what the first of them looked like."""
 
-    def __init__(self, result: Calibration, wish: Wish) -> None:
-        """Take over the model, the temperature slopes and what is wished for."""
+    def __init__(self, result: Calibration, options: ColumnOptions) -> None:
+        """Take over the model, the temperature slopes and the options."""
         own = "g" if result.unit == "g" else "m/s^2"
-        self.g, self.factor = result.g, UNITS[wish.unit or own] / UNITS[own]
-        self.model, self.warmth = result.model, result.temperature
-        self.tilt = Tilt.of(result, wish.noise) if wish.tilt else None
+        self.g, self.factor = result.g, UNITS[options.unit or own] / UNITS[own]
+        self.model, self.slopes = result.model, result.temperature
+        self.tilt = Tilt.of(result, options.noise) if options.tilt else None
         self.first: float | None = None
 
     def __call__(self, numbers: Float) -> Float:
         """Return the new columns, shape (B, k), of output, shape (B, 3), or with temperature, shape (B, 4)."""
         output = numbers[:, :3]
-        if self.warmth is not None and numbers.shape[1] > 3:
-            output = self.warmth.at_reference(output, numbers[:, 3], self.model.D)
+        if self.slopes is not None and numbers.shape[1] > 3:
+            output = self.slopes.at_reference(output, numbers[:, 3], self.model.D)
         force = self.model.specific_force(output)
         if self.first is None and len(force):
             self.first = float(np.median(np.linalg.norm(force[:LOOKED_AT], axis=1))) / self.g
@@ -113,7 +113,7 @@ class Log:
 
     table: Table
     change: Change
-    formula: Formula
+    formula: Correction
     notes: tuple[str, ...]
 
     @property
@@ -139,27 +139,27 @@ class Log:
         (to_parquet if parquet else to_text)(self.table, self.change, file)
 
 
-def prepare(result: Calibration, table: Table, wanted: list[str] | None, wish: Wish) -> Log:
+def prepare(result: Calibration, table: Table, wanted: list[str] | None, options: ColumnOptions) -> Log:
     """Return a log together with what the result makes of it.
 
     Args:
         result: the calibration; its verdict is the caller's concern.
         table: the log; `wanted` names its three output columns, or None.
-        wish: what to write.
+        options: what to write.
 
     Raises:
         DataError, UsageError: no such columns, or a new one has the name of one that is there.
     """
     columns = choose(table, wanted)
     names = list(table.names or ())
-    kept = [n for k, n in enumerate(names) if not (wish.replace and k in columns.output)]
-    taken = [name for name in wish.names if name in kept]
+    kept = [n for k, n in enumerate(names) if not (options.replace and k in columns.output)]
+    taken = [name for name in options.names if name in kept]
     if taken:
         raise DataError(f'{table.name}: has a column "{taken[0]}" already; choose another --prefix')
     warm = () if result.temperature is None or columns.temperature is None else (columns.temperature,)
-    places = columns.output if wish.replace else ()
-    formula = Formula(result, wish)
-    change = Change(Selection((*columns.output, *warm)), formula, wish.names, places)
+    places = columns.output if options.replace else ()
+    formula = Correction(result, options)
+    change = Change(Selection((*columns.output, *warm)), formula, options.names, places)
     return Log(table, change, formula, _notes(columns, result, used=bool(warm)))
 
 
@@ -219,8 +219,7 @@ class Tilt:
         products = (direction[:, :, None] * ones[:, None, :]).reshape(len(f), 12)
         parts = products @ (self.moves.reshape(-1, 12).T @ self.root)
         noise = self.noise**2 * np.einsum("bi,bi->b", direction, direction)
-        sigma: Float = np.sqrt(np.einsum("bm,bm->b", parts, parts) + noise)
-        return sigma
+        return np.asarray(np.sqrt(np.einsum("bm,bm->b", parts, parts) + noise))
 
 
 def _nine(result: Calibration) -> tuple[Float, Float]:

@@ -15,7 +15,7 @@ from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.distributions import chi_square_chance
 from accelcal_cli.calibration.fit import Fit
 from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Verdict, poses_to_add
-from accelcal_cli.calibration.search import Solution, rounding
+from accelcal_cli.calibration.search import rounding
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -136,25 +136,21 @@ def edge_names(at_wall: Bool) -> tuple[str, ...]:
 
 def _to_gain(fit: Fit) -> Float:
     """Return the part of the cost that a Gauss-Newton step would take off, shape (R,); 0 after a polish."""
+    gain = np.zeros(len(fit.sample))
     solution = fit.solution
     if solution is None or fit.settings.polish:
-        return np.zeros(len(fit.sample))
-    return np.array([_gain(solution, at) for at in range(len(fit.sample))])
-
-
-def _gain(solution: Solution, at: int) -> float:
+        return gain
     cost, x = solution.cost, solution.x[:, None]
-    if solution.value[at] <= rounding(cost)[at]:
-        return 0.0
-    residual, slope = cost.residuals(x)[at, 0], cost.jacobian(x)[at, 0]
-    step = np.linalg.lstsq(slope, residual)[0]
-    return float(np.sum((slope @ step) ** 2) / np.sum(residual**2))
+    residuals, slopes = cost.residuals(x)[:, 0], cost.jacobian(x)[:, 0]
+    for at in np.flatnonzero(solution.value > rounding(cost)):
+        step = np.linalg.lstsq(slopes[at], residuals[at])[0]
+        gain[at] = np.sum((slopes[at] @ step) ** 2) / np.sum(residuals[at] ** 2)
+    return gain
 
 
 def _scale_sigma(fit: Fit) -> Float:
     """Return the largest one-sigma of a scale factor, as a part of it, shape (R,)."""
-    sigma: Float = np.sqrt(np.einsum("rpp->rp", fit.covariance)[:, SCALE]).max(axis=1) / fit.settings.g
-    return sigma
+    return np.asarray(np.sqrt(np.einsum("rpp->rp", fit.covariance)[:, SCALE]).max(axis=1) / fit.settings.g)
 
 
 def _may_have_cautions(fit: Fit, left: Float) -> Bool:
@@ -164,8 +160,7 @@ def _may_have_cautions(fit: Fit, left: Float) -> Bool:
     noisy |= fit.noise[0] >= MORE_THAN_NOISE
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
-    found: Bool = noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always
-    return found
+    return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
 
 def _cautions(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[str, ...]:

@@ -194,13 +194,13 @@ def _settings_record(assessment: Assessment, at: int) -> dict[str, object]:
     settings, solution = assessment.fit.settings, assessment.fit.solution
     stated = asdict(settings)
     if solution is not None:
-        start = solution.stated.start
+        problem, box = solution.stated, solution.stated.cost.box
         stated["parameters"] = asdict(settings.build_optimizer())
         stated["box"] = {
             **asdict(settings.box),
-            "centre": start.box.centre[at].tolist(),
-            "half_width": start.box.half[at].tolist(),
-            "source": start.sources[at],
+            "centre": box.centre[at].tolist(),
+            "half_width": box.half[at].tolist(),
+            "source": problem.sources[at],
         }
     return {**stated, "version": __version__}
 
@@ -213,7 +213,7 @@ def _notes(assessment: Assessment, at: int) -> tuple[str, ...]:
     if solution is not None and readings.reference is not None:
         lines.append("The columns of a reference specific force are used with --attitudes known only.")
     lines += fit.notes
-    if solution is not None and solution.stated.start.sources[at] == "sphere":
+    if solution is not None and solution.stated.sources[at] == "sphere":
         lines.append("The readings fix no ellipsoid; the search started from the nearest sphere.")
     if not np.isfinite(search.cost[at]):
         lines.append(f"The {search.optimizer} search failed; the result is the polished nominal sensor.")

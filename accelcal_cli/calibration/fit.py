@@ -148,17 +148,17 @@ def fit(solution: Solution) -> Fit:
     """Fit a solution: one pass over the readings, everything for all sensors at once."""
     settings, sample = solution.stated.settings, solution.sample
     g, held = settings.g, None if settings.misalignment else ALIGNED
-    K, D = solution.cost.parameters(solution.x)
-    lower, own_D, information = _determined(solution, K, D)
+    K, D, lower, own_D, information = _determined(solution)
     observability = Observability.of(information, sample.poses, held)
     freedom = sample.poses - min(9, solution.cost.unknowns) - SLOPES * (solution.slopes is not None)
-    reading = _pass(solution, lower, own_D)
-    residuals = _residuals(reading, sample, _absorbed(solution, observability), freedom, held, g)
-    variance = np.where(freedom > 0, reading.variance(solution, freedom), np.nan)
-    noise = _noise_ratio(variance, reading.sums[2] / sample.poses, freedom)
-    at_wall = _at_wall(solution.x)
+    centre = solution.stated.cost.box.centre
+    nominal, bias, before = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
+    sums, kept = _pass(solution, (lower, own_D), (nominal, bias))
+    residuals = _residuals(sums[3], kept, sample, _absorbed(solution, observability), freedom, held, g)
+    variance = _variance(solution, sums, freedom)
+    noise = _noise_ratio(variance, sums[2] / sample.poses, freedom)
+    at_wall, shown = _at_wall(solution.x), to_gauge(K, settings.gauge)
     covariance = _covariance(observability, variance, np.asarray(at_wall.any(axis=1)), g)
-    shown = to_gauge(K, settings.gauge)
     sigma_K, sigma_D = propagate(shown, lower, covariance, settings.gauge, g)
     view, information, sight = _first_sight(solution, observability, information, (lower, D))
     return Fit(
@@ -181,10 +181,10 @@ def fit(solution: Solution) -> Fit:
         s=np.sqrt(variance),
         covariance=covariance,
         at_wall=at_wall,
-        rms=np.sqrt(reading.sums[0] / sample.poses),
-        rms_before=np.sqrt(reading.sums[1] / sample.poses),
-        before=reading.words,
-        nominal=reading.nominal,
+        rms=np.sqrt(sums[0] / sample.poses),
+        rms_before=np.sqrt(sums[1] / sample.poses),
+        before=before,
+        nominal=nominal,
         residuals=residuals,
         noise=noise,
         solution=solution,
@@ -192,12 +192,13 @@ def fit(solution: Solution) -> Fit:
     )
 
 
-def _determined(solution: Solution, K: Float, D: Float) -> tuple[Float, Float, Float]:
-    """Return K and D in gauge `lower` and J^T J of the nine parameters, less what temperature slopes take of it."""
+def _determined(solution: Solution) -> tuple[Float, Float, Float, Float, Float]:
+    """Return K and D, the same in gauge `lower`, and J^T J of the nine parameters, less what slopes take of it."""
+    K, D = solution.cost.parameters(solution.x)
     nine, point = solution.plain.in_lower(K, D)
     information = nine.information(point)
     loss = 0.0 if solution.slopes is None else solution.slopes.loss
-    return *nine.parameters(point), information - loss
+    return K, D, *nine.parameters(point), information - loss
 
 
 def _first_sight(
@@ -208,7 +209,7 @@ def _first_sight(
     Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
     nearest sphere then sees the attitudes better than the fit does.
     """
-    sphere = np.array([source == "sphere" for source in solution.stated.start.sources])
+    sphere = np.array([source == "sphere" for source in solution.stated.sources])
     if not sphere.any():
         return observability, information, found
     held = None if solution.stated.settings.misalignment else ALIGNED
@@ -251,34 +252,16 @@ def _at_wall(x: Float) -> Bool:
     return edge
 
 
-@dataclass(frozen=True, eq=False)
-class _Pass:
-    """What one pass over the readings leaves, per sensor, and of the poses that are kept.
+def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:
+    """Return s^2, (m/s^2)^2, shape (R,): sum w e^2 over the degrees of freedom, NaN without any; `sums` as of `_pass`.
 
-    Attributes:
-        sums: over the poses, shape (6, R), of (|f| - g)^2 after and before, of the variance that scatter explains, of
-            w e^2 (weights of a robust loss and all), and of psi^2, all (m/s^2)^2, and psi' under a robust loss.
-        columns: of the kept poses: number, sqrt(w) e, w, f and e before, shapes (R, k) and (R, k, 3).
-        words, nominal: what the readings were taken for, and the scale factors of that.
+    Under a robust loss the factor of (J^T W J)^-1 in the covariance of the M-estimate [huber1981]:
+    sum psi^2 / (J - p) / (mean psi')^2, W the weights of the poses without those of the loss.
     """
-
-    sums: Float
-    columns: list[Float]
-    words: list[str]
-    nominal: Float
-
-    def variance(self, solution: Solution, freedom: Int) -> Float:
-        """Return s^2, (m/s^2)^2, shape (R,): sum w e^2 over the degrees of freedom.
-
-        Under a robust loss the factor of (J^T W J)^-1 in the covariance of the M-estimate [huber1981]:
-        sum psi^2 / (J - p) / (mean psi')^2, W the weights of the poses without those of the loss.
-        """
-        room = np.maximum(freedom, 1)
-        if _robust(solution) is None:
-            return np.asarray(
-                solution.value / (4.0 * solution.stated.settings.g**2) / room
-            )  # L = sum (2 g e)^2
-        return np.asarray(self.sums[4] / room / (self.sums[5] / solution.sample.poses) ** 2)
+    room = np.where(freedom > 0, freedom, np.nan)
+    if _robust(solution) is None:
+        return np.asarray(solution.value / (4.0 * solution.stated.settings.g**2) / room)  # L = sum (2 g e)^2
+    return np.asarray(sums[4] / room / (sums[5] / solution.sample.poses) ** 2)
 
 
 def uncalibrated(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:
@@ -311,16 +294,26 @@ def _robust(solution: Solution) -> Float | None:
     return None if noise is None or (noise <= NO_NOISE * solution.stated.settings.g).all() else noise
 
 
-def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
-    """Go over the readings once, block by block."""
+def _pass(
+    solution: Solution, found: tuple[Float, Float], taken_for: tuple[Float, Float]
+) -> tuple[Float, list[Float]]:
+    """Go over the readings once, block by block.
+
+    Args:
+        solution: of R sensors; found: their K, gauge `lower`, and D.
+        taken_for: scale factors and biases of the readings before calibration, shape (R, 3).
+
+    Returns:
+        Sums over the poses, shape (6, R): of (|f| - g)^2 after and before, of the variance that scatter explains, of
+        w e^2 (weights of a robust loss and all), and of psi^2, all (m/s^2)^2, and psi' under a robust loss. Columns of
+        the poses that are kept: number, sqrt(w) e, w, f and e before, shapes (R, k) and (R, k, 3).
+    """
     settings, sample, weights = solution.stated.settings, solution.sample, solution.stated.weights
     g, noise, sensors = settings.g, _robust(solution), len(solution.sample)
-    centre = solution.stated.start.box.centre
-    nominal, bias, words = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
-    raw = sample.errors(nominal[..., None] * np.eye(3), bias, g)
+    raw = sample.errors(taken_for[0][..., None] * np.eye(3), taken_for[1], g)
     sums: list[Float] = []
     parts: list[list[Float]] = []
-    for (first, e, f), (_, e_raw, _) in zip(sample.errors(K, D, g), raw, strict=True):
+    for (first, e, f), (_, e_raw, _) in zip(sample.errors(*found, g), raw, strict=True):
         real = sample.real(first, e.shape[1])
         w = real.astype(float) if weights is None else weights[:, first : first + e.shape[1]]
         psi: Float = np.zeros((sensors, 1))
@@ -331,13 +324,13 @@ def _pass(solution: Solution, K: Float, D: Float) -> _Pass:
             slope = loss_slope(z, settings.robust)
             w = w * loss_weight(z, settings.robust)
         scaled = np.sqrt(w) * e
-        expected = np.where(real, sample.explained(first, f, K), 0.0)
+        expected = np.where(real, sample.explained(first, f, found[0]), 0.0)
         squares = (real * length_error(e, g) ** 2, real * length_error(e_raw, g) ** 2, expected, scaled**2)
         sums.append(np.stack([np.sum(part, axis=1) for part in (*squares, psi**2, slope)]))
         number = np.broadcast_to(first + np.arange(e.shape[1]), e.shape)
         parts.append(_worst([number.astype(float), scaled, w, f, e_raw], sample))
     kept = _worst([np.concatenate(column, axis=1) for column in zip(*parts, strict=True)], sample)
-    return _Pass(np.sum(sums, axis=0), kept, words, nominal)
+    return np.sum(sums, axis=0), kept
 
 
 def _worst(columns: list[Float], sample: Sample) -> list[Float]:
@@ -353,22 +346,27 @@ def _worst(columns: list[Float], sample: Sample) -> list[Float]:
 
 def length_error(e: Float, g: float) -> Float:
     """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
-    error: Float = np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g
-    return error
+    return np.asarray(np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g)
 
 
 def _residuals(
-    reading: _Pass, sample: Sample, cofactor: Float, freedom: Int, held: Bool | None, g: float
+    total: Float,
+    kept: list[Float],
+    sample: Sample,
+    cofactor: Float,
+    freedom: Int,
+    held: Bool | None,
+    g: float,
 ) -> PoseResiduals:
     """Return the kept residuals with their leverage, studentised and with the pose left out, and the outliers."""
-    order, scaled, w, f, e_raw = reading.columns
+    order, scaled, w, f, e_raw = kept
     number = order.astype(np.intp)
     real, free = number < sample.poses[:, None], freedom[:, None]
     f = np.ascontiguousarray(f)
     size = np.linalg.norm(f, axis=2)
     leverage = leverages(design(f / np.where(size > 0, size, 1.0)[..., None]), w, cofactor)
     room = room_of(leverage)
-    error, studentised = size - g, studentise(scaled, room, reading.sums[3][:, None], free)
+    error, studentised = size - g, studentise(scaled, room, total[:, None], free)
     left_out = error / room
     sensor, pose = np.nonzero(is_suspect(studentised, error, free, g) & real)
     if number.shape[1] < int(
@@ -405,8 +403,7 @@ def leverages(rows: Float, w: Float, cofactor: Float) -> Float:
         rows: their design, shape (..., J, 9); w: their weights, shape (..., J).
         cofactor: (J^T W J)^-1, shape (..., 9, 9).
     """
-    leverage: Float = np.minimum(w * np.sum((rows @ cofactor) * rows, axis=-1), 1.0)
-    return leverage
+    return np.asarray(np.minimum(w * np.sum((rows @ cofactor) * rows, axis=-1), 1.0))
 
 
 def room_of(leverage: Float) -> Float:
@@ -423,8 +420,7 @@ def studentise(scaled: Float, room: Float, total: Float | float, freedom: Int | 
     """
     others = np.maximum(total - scaled**2 / room, 0.0) / np.maximum(freedom - 1, 1)
     deviation = np.sqrt(np.where((others > 0) & (np.asarray(freedom) >= 2), others, np.nan) * room)
-    found: Float = -scaled / deviation
-    return found
+    return np.asarray(-scaled / deviation)
 
 
 def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
@@ -508,8 +504,7 @@ def _moved(force: Float, step: Float, g: float) -> Float:
     E = np.zeros((len(step), 3, 3))
     for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
         E[:, i, j] = step[:, p] / g
-    moved: Float = force + force @ E.swapaxes(1, 2) - step[:, None, 6:]
-    return moved
+    return np.asarray(force + force @ E.swapaxes(1, 2) - step[:, None, 6:])
 
 
 def _covariance(observability: Observability, variance: Float, walled: Bool, g: float) -> Float:

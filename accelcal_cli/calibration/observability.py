@@ -70,8 +70,7 @@ CERTAIN = 1e6
 
 def knowing(information: Float, held: Bool) -> Float:
     """Return information, shape (9, 9), to which that of knowing some parameters, shape (9,), is added."""
-    known: Float = information + CERTAIN * np.diag(held.astype(float))
-    return known
+    return np.asarray(information + CERTAIN * np.diag(held.astype(float)))
 
 
 PRIOR = 1e-6
@@ -185,8 +184,7 @@ class Observability:
 def directions_of(output: Float, model: ErrorModel) -> Float:
     """Return the unit directions of the specific force of outputs, both shape (J, 3)."""
     force = model.specific_force(output)
-    unit: Float = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
-    return unit
+    return np.asarray(force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300))
 
 
 def attitudes(u: Float, n: NDArray[np.int64], angle: float) -> list[Int]:
@@ -258,13 +256,13 @@ def next_poses(
         gain = rows @ cofactor
         drop = gain**2 / (1.0 + np.einsum("cp,cp->c", gain, rows))[:, None]
         after = np.diagonal(cofactor) - drop
-        best = int(np.argmin(_score(after, np.inf)))
+        best = int(np.argmin(pose_score(after, np.inf)))
         chosen.append(best)
         cofactor = cofactor - np.outer(gain[best], gain[best]) / (1.0 + gain[best] @ rows[best])
     return chosen
 
 
-def _score(variances: Float, power: float) -> Float:
+def pose_score(variances: Float, power: float) -> Float:
     """Return the logarithm of a norm of variances, shape (..., 9), and a little of their sum."""
     largest = variances.max(axis=-1)
     score = np.log(largest)

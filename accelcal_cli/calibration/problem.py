@@ -493,19 +493,6 @@ def _centre(y: Float) -> tuple[Float, Float]:
     return d, -np.sum(m * d, axis=1)
 
 
-@dataclass(frozen=True)
-class Start:
-    """Where searches start.
-
-    Attributes:
-        box: the search box of each of R sensors, D = 6, 9 or 12.
-        sources: of each: "stated", "closed form" or "sphere".
-    """
-
-    box: Box
-    sources: tuple[str, ...]
-
-
 def packed(sample: Sample, weights: Float | None, within: Sample | None = None) -> Triangle:
     """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
     extent = within or sample
@@ -518,8 +505,10 @@ def packed(sample: Sample, weights: Float | None, within: Sample | None = None) 
     return compress(blocks, centre, scale, sample.poses)
 
 
-def search_box(triangle: Triangle, settings: Settings) -> Start:
-    """Return the search box of each sensor; the same in any company.
+def search_box(triangle: Triangle, settings: Settings) -> tuple[Box, tuple[str, ...]]:
+    """Return the search box of each sensor, and where it comes from: "stated", "closed form" or "sphere".
+
+    The same in any company.
 
     Args:
         triangle: the compressed readings of R sensors.
@@ -530,7 +519,7 @@ def search_box(triangle: Triangle, settings: Settings) -> Start:
     if settings.nominal is not None:
         K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))
         D = np.broadcast_to(settings.nominal.bias, (sensors, 3))
-        return Start(_box(K, D, settings, unknowns), ("stated",) * sensors)
+        return _box(K, D, settings, unknowns), ("stated",) * sensors
     K, D = _closed_form(triangle, settings.g)
     index = np.flatnonzero(np.isfinite(K).all(axis=(1, 2)))
     index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
@@ -544,9 +533,8 @@ def search_box(triangle: Triangle, settings: Settings) -> Start:
     box = _box(K, D, settings, unknowns)
     u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
     moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
-    return Start(
-        Box(np.where(closed[:, None], moved, box.centre), box.half),
-        tuple("closed form" if c else "sphere" for c in closed),
+    return Box(np.where(closed[:, None], moved, box.centre), box.half), tuple(
+        "closed form" if c else "sphere" for c in closed
     )
 
 
@@ -591,8 +579,8 @@ def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Floa
     return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
 
 
-def opened(sample: Sample, settings: Settings, weights: Float | None) -> tuple[Loetters, Start]:
-    """Return the cost of weighted readings in its box, and where the box comes from."""
+def opened(sample: Sample, settings: Settings, weights: Float | None) -> tuple[Loetters, tuple[str, ...]]:
+    """Return the cost of weighted readings in its box, and where the box of each sensor comes from."""
     triangle = packed(sample, weights)
-    start = search_box(triangle, settings)
-    return Loetters(triangle, settings.g, start.box), start
+    box, sources = search_box(triangle, settings)
+    return Loetters(triangle, settings.g, box), sources

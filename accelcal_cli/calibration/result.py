@@ -75,8 +75,7 @@ class Temperature:
             D: D_a at the reference temperature, shape (3,).
         """
         t = (degrees - self.reference)[:, None]
-        brought: Float = (output - D - self.bias * t) / (1.0 + self.scale * t) + D
-        return brought
+        return np.asarray((output - D - self.bias * t) / (1.0 + self.scale * t) + D)
 
 
 @dataclass(frozen=True, eq=False)

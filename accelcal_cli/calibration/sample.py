@@ -184,8 +184,7 @@ class Sample:
         part = slice(first, first + f.shape[1])
         u = f / np.linalg.norm(f, axis=2, keepdims=True)
         force = self.scatter[:, part] / np.einsum("rii->ri", K)[:, None, :]
-        variance: Float = np.sum((u * force) ** 2, axis=2) / self.count[:, part]
-        return variance
+        return np.asarray(np.sum((u * force) ** 2, axis=2) / self.count[:, part])
 
     def errors(self, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
         """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).

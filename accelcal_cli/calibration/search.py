@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.problem import Loetters, Start, compress, opened
+from accelcal_cli.calibration.problem import Loetters, compress, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
@@ -51,14 +51,14 @@ class Stated:
     Attributes:
         sample: their readings; settings: of the calibration.
         weights: of the poses, shape (R, J), or None.
-        cost: the Loetters cost in its box; start: where the box comes from.
+        cost: the Loetters cost in its box; sources: where the box of each sensor comes from, see `search_box`.
     """
 
     sample: Sample
     settings: Settings
     weights: Float | None
     cost: Loetters
-    start: Start
+    sources: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +135,8 @@ class Solution:
 def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
     weights = None if settings.weights == "auto" else sample.weights(settings.weights)
-    cost, start = opened(sample, settings, weights)
-    stated = Stated(sample, settings, weights, cost, start)
+    cost, sources = opened(sample, settings, weights)
+    stated = Stated(sample, settings, weights, cost, sources)
     return _shared(stated) if settings.weights == "auto" else stated
 
 
@@ -187,7 +187,7 @@ def _closed(stated: Stated) -> Run:
     cost, settings = stated.cost, stated.settings
     x = cost.least_cost()
     inside = np.isfinite(x).all(axis=1) & (np.abs(np.nan_to_num(x)) < 1.0).all(axis=1)
-    lacking = np.flatnonzero(~inside | np.array([source == "sphere" for source in stated.start.sources]))
+    lacking = np.flatnonzero(~inside | np.array([source == "sphere" for source in stated.sources]))
     evaluations = np.zeros(len(x), dtype=np.int64)
     if len(lacking):
         # Each of them would be run 0 of a calibration of its own.
@@ -243,8 +243,8 @@ def _shared(stated: Stated) -> Stated:
             break
         before, weights = shared, 1.0 / (shared + own)
         weights = weights / weights.mean()
-        cost, start = opened(sample, settings, weights)
-        stated = Stated(sample, settings, weights, cost, start)
+        cost, sources = opened(sample, settings, weights)
+        stated = Stated(sample, settings, weights, cost, sources)
     return stated
 
 

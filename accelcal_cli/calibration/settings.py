@@ -10,7 +10,7 @@ from typing import Any, Literal
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, shipped_parameters
-from accelcal_cli.schema import check, from_mapping, setting
+from accelcal_cli.schema import Checked, check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
 Robust = Literal["none", "huber", "soft-l1"]
@@ -35,16 +35,12 @@ KNOWN = {"robust": ("none",), "weights": ("none", "n", "sd")}
 
 
 @dataclass(frozen=True)
-class BoxSettings:
+class BoxSettings(Checked):
     """Half-widths of the search box around the nominal sensor."""
 
     scale: float = setting(0.05, "scale factors, part of nominal", above=0, high=0.9)
     misalignment: float = setting(0.06, "misalignments, rad", above=0, high=0.7)
     bias: float = setting(0.10, "bias, part of g times nominal scale factor", above=0, high=10)
-
-    def __post_init__(self) -> None:
-        """Refuse a half-width outside its range."""
-        check(self)
 
 
 @dataclass(frozen=True)

@@ -130,5 +130,4 @@ def _slope_dop(information: Float) -> Float:
     values = np.linalg.eigvalsh(information)
     if values[0] <= RANK_TOLERANCE * values[-1]:
         return np.full(SLOPES, np.inf)
-    dop: Float = np.sqrt(np.diagonal(np.linalg.inv(information))[9:])
-    return dop
+    return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(information))[9:]))

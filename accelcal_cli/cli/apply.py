@@ -55,19 +55,19 @@ def command(
     Adds the calibrated specific force as columns fx, fy, fz. All other columns stay as they are, byte for byte in
     text. The log streams through: memory does not grow with it.
     """
-    from accelcal_cli.calibration.apply import Wish, prepare
+    from accelcal_cli.calibration.apply import ColumnOptions, prepare
     from accelcal_cli.io.reader import open_table
     from accelcal_cli.output.files import whole_file
 
     options.check_input(data)
     options.check_files([result], {"-o": output})  # the log itself may be the output
-    wish = Wish(unit, replace, prefix, tilt, noise)
+    wanted = ColumnOptions(unit, replace, prefix, tilt, noise)
     calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)
     options.caution(result, calibration.cautions, quiet)
     table = open_table(data, sys.stdin.buffer, hashed=False)
     try:
-        log = prepare(calibration, table, options.split_columns(columns), wish)
+        log = prepare(calibration, table, options.split_columns(columns), wanted)
         parquet = Path(output).suffix.lower() in PARQUET
         if parquet and not log.parquet:
             raise UsageError(f'-o "{output}": {data} is text and is written as text; expected another ending')

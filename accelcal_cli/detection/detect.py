@@ -311,7 +311,7 @@ def screen(readings: Readings, g: float) -> tuple[ErrorModel, float, float, str]
     """
     sample, settings = Sample.of([readings]), Settings("levenberg-marquardt", g=g, weights="auto")
     plain = state(sample, replace(settings, weights="none"))
-    if plain.start.sources[0] == "sphere":
+    if plain.sources[0] == "sphere":
         # Where the poses determine no more than the nearest sphere, no search has to find that out.
         middle = np.zeros_like(plain.cost.box.centre)
         if Observability.of(plain.cost.information(middle)[0], readings.poses).verdict == "undetermined":

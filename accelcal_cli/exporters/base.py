@@ -17,7 +17,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import Checked, setting
 from accelcal_cli.sensor.model import MRAD, STANDARD_GRAVITY, ErrorModel
 from accelcal_cli.sensor.poses import AXES
 
@@ -34,7 +34,7 @@ class Export:
 
 
 @dataclass(frozen=True)
-class Exporter(ABC):
+class Exporter(Checked, ABC):
     """Base of all exporters; the fields of a subclass are the options of `accelcal export` that it takes.
 
     Fields are made with `schema.setting`, which holds their help and range. An option that several formats take has
@@ -46,10 +46,6 @@ class Exporter(ABC):
     """Usual ending of a file of this format."""
     binary: ClassVar[bool] = False
     """Whether the content is no text, so that it cannot go to a terminal."""
-
-    def __post_init__(self) -> None:
-        """Refuse an option outside its range."""
-        check(self)
 
     def export(self, result: Calibration) -> Export:
         """Return a result in this format; whether its verdict allows that is the caller's concern.

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import Checked, setting
 
 STATES = 12
 MINUTE, TAYLOR_TERMS, LONG_TERMS = 60.0, 9, 16
@@ -172,7 +172,7 @@ def to_metric(F: Float, before: Float, after: Float) -> Float:
 
 
 @dataclass(frozen=True)
-class InsGrade:
+class InsGrade(Checked):
     """How accurate an inertial navigation system is [depf2015] Table 1.
 
     Attributes:
@@ -192,10 +192,6 @@ class InsGrade:
         "platform",
         "level biases stay fixed to east and north (platform) or turn with the vehicle (strapdown)",
     )
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
 
     def biases(self) -> Float:
         """Return sigma of the five biases: m/s^2 (2), rad/s (3)."""

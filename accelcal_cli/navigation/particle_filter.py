@@ -19,7 +19,7 @@ from accelcal_cli.navigation.ins import STATES, process_noise
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
-from accelcal_cli.schema import check, setting
+from accelcal_cli.schema import Checked, setting
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class PositionEstimates:
 
 
 @dataclass(frozen=True)
-class Filter(ABC):
+class Filter(Checked, ABC):
     """A filter; its dataclass fields are its YAML keys.
 
     Raises:
@@ -58,10 +58,6 @@ class Filter(ABC):
     mode: Literal["default", "literal"] = setting(
         "default", "`literal`: as the paper prints it, with R as stated; `default`: R enlarged"
     )
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        check(self)
 
     @abstractmethod
     def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
