@@ -20,7 +20,7 @@ from accelcal_cli.calibration.observability import gauge_chain
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import Selection, Table, TextTable
+from accelcal_cli.io.reader import InputTable, Selection, TextTable
 from accelcal_cli.io.rewrite import Change, rewrite
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES
@@ -111,7 +111,7 @@ class Log:
         notes: what a user should know.
     """
 
-    table: Table
+    table: InputTable
     change: Change
     formula: Correction
     notes: tuple[str, ...]
@@ -139,7 +139,7 @@ class Log:
         (to_parquet if parquet else to_text)(self.table, self.change, file)
 
 
-def prepare(result: Calibration, table: Table, wanted: list[str] | None, options: ColumnOptions) -> Log:
+def prepare(result: Calibration, table: InputTable, wanted: list[str] | None, options: ColumnOptions) -> Log:
     """Return a log together with what the result makes of it.
 
     Args:

@@ -94,7 +94,7 @@ def _towards_sphere(outputs: Float) -> Float:
 
 
 @dataclass(frozen=True)
-class Status:
+class CaptureStatus:
     """What the sensor is doing.
 
     Attributes:
@@ -147,7 +147,7 @@ class Capture:
         self.done_here = False
         self.rough: RoughSensor | None = None
 
-    def push(self, reading: Float) -> Status | None:
+    def push(self, reading: Float) -> CaptureStatus | None:
         """Add one reading, shape (3,); None while the first window fills.
 
         Raises:
@@ -164,7 +164,7 @@ class Capture:
         state = self._step(reading, mean, rough, quiet=spread <= limit, limit=limit)
         direction = (self.rough or rough).directions(mean)
         nearest, angle = _nearest(direction, self.planned)
-        return Status(state, spread, limit, min(len(self.run) / self.hold, 1.0), nearest, angle)
+        return CaptureStatus(state, spread, limit, min(len(self.run) / self.hold, 1.0), nearest, angle)
 
     def _step(self, reading: Float, mean: Float, rough: RoughSensor, *, quiet: bool, limit: float) -> State:
         if not quiet:

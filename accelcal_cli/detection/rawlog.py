@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import RawColumns, choose_raw
-from accelcal_cli.io.reader import RowBlock, Table, open_table, shorten
+from accelcal_cli.io.reader import InputTable, RowBlock, open_table, shorten
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
@@ -67,7 +67,7 @@ def open_raw_log(
 class RawLog:
     """A raw log that is read once, from top to bottom."""
 
-    def __init__(self, table: Table, columns: RawColumns) -> None:
+    def __init__(self, table: InputTable, columns: RawColumns) -> None:
         """Read the first rows of `table` to find out what the time column is."""
         self.name = table.name
         self.columns = columns

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
-from accelcal_cli.io.reader import Selection, Table
+from accelcal_cli.io.reader import InputTable, Selection
 
 Triple = tuple[int, int, int]
 Group = dict[str, tuple[list[int], list[int], list[int]]]
@@ -146,7 +146,7 @@ class RawColumns:
         return Selection(sensors, texts=time) if self.dated else Selection((*sensors, *time))
 
 
-def choose(table: Table, wanted: Sequence[str] | None = None, sensor: int | None = None) -> Columns:
+def choose(table: InputTable, wanted: Sequence[str] | None = None, sensor: int | None = None) -> Columns:
     """Find the three output columns and the optional ones.
 
     Args:
@@ -177,7 +177,7 @@ def choose(table: Table, wanted: Sequence[str] | None = None, sensor: int | None
 
 
 def choose_raw(
-    table: Table,
+    table: InputTable,
     columns: Sequence[str] | None = None,
     gyro: Sequence[str] | None = None,
     time: str | None = None,
@@ -205,7 +205,7 @@ def choose_raw(
     return replace(raw, gyro=turning, time=clock, dated=clock is not None and not table.numeric[clock])
 
 
-def sensor_column(table: Table, wanted: str | None = None) -> int:
+def sensor_column(table: InputTable, wanted: str | None = None) -> int:
     """Find the column that labels the sensor; DataError or UsageError if in doubt."""
     option, names = "--sensor-column", table.names
     if wanted is not None:
@@ -229,13 +229,13 @@ def sensor_column(table: Table, wanted: str | None = None) -> int:
     return candidates[0]
 
 
-def own_sensor_column(table: Table) -> int | None:
+def own_sensor_column(table: InputTable) -> int | None:
     """Return the column that labels the sensor in a table of one sensor, None where there are none or several."""
     sensors = recognise(table.names or ()).alone["sensor"]
     return sensors[0] if len(sensors) == 1 else None
 
 
-def parse_triple(table: Table, wanted: Sequence[str], option: str = "--columns") -> Triple:
+def parse_triple(table: InputTable, wanted: Sequence[str], option: str = "--columns") -> Triple:
     """Return the three columns that the user names or numbers; UsageError names the `option`."""
     words = [word.strip() for word in (wanted[0].split(",") if len(wanted) == 1 else wanted)]
     if len(words) != 3:
@@ -247,7 +247,7 @@ def parse_triple(table: Table, wanted: Sequence[str], option: str = "--columns")
     return columns[0], columns[1], columns[2]
 
 
-def find_column(table: Table, word: str, option: str = "--columns") -> int:
+def find_column(table: InputTable, word: str, option: str = "--columns") -> int:
     """Find a column by exact name, by name in any case or without its unit, or by number."""
     names, width = table.names, len(table.numeric)
     for fold in (str, str.lower, _bare_name):
@@ -330,7 +330,7 @@ def tokens_of(name: str) -> list[str]:
     return [word for word in words if word not in _MEAN] or words
 
 
-def _only_family(table: Table, roles: Roles) -> Triple:
+def _only_family(table: InputTable, roles: Roles) -> Triple:
     if len(roles.families) > 1:
         raise DataError(
             f"{table.name}: the readings could be {' or '.join(roles.families)}; say which with --columns"
@@ -343,7 +343,7 @@ def _only_family(table: Table, roles: Roles) -> Triple:
     return next(iter(roles.families.values()))
 
 
-def _only_three(table: Table, roles: Roles, sensor: int | None) -> Triple:
+def _only_three(table: InputTable, roles: Roles, sensor: int | None) -> Triple:
     """Return the three columns whose names do not say that they are something else, if there are just three."""
     names, width = table.names, len(table.numeric)
     known = {
@@ -380,7 +380,7 @@ def _only_three(table: Table, roles: Roles, sensor: int | None) -> Triple:
 
 
 def _with_extras(
-    table: Table, output: Triple, roles: Roles, notes: tuple[str, ...], sensor: int | None
+    table: InputTable, output: Triple, roles: Roles, notes: tuple[str, ...], sensor: int | None
 ) -> Columns:
     """Add the optional columns that are not themselves the output or the label of the sensor."""
     names, taken = table.names, {*output, sensor}
@@ -413,7 +413,7 @@ def _with_extras(
     return replace(columns, notes=(*notes, *roles.partial))
 
 
-def _by_name(table: Table, wanted: Sequence[str] | None) -> RawColumns:
+def _by_name(table: InputTable, wanted: Sequence[str] | None) -> RawColumns:
     """Go by the names of the columns, or, for a stated accelerometer, by what the names leave."""
     columns = choose(table, wanted)
     if table.names is not None:
@@ -422,7 +422,7 @@ def _by_name(table: Table, wanted: Sequence[str] | None) -> RawColumns:
     return RawColumns(columns.output, columns.names, time=guess, guessed=True)
 
 
-def _by_width(table: Table) -> RawColumns:
+def _by_width(table: InputTable) -> RawColumns:
     """Go by the number of columns of a log without a header."""
     width = len(table.numeric)
     if width not in NAMELESS:

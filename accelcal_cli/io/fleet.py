@@ -17,7 +17,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_column
-from accelcal_cli.io.reader import RowBlock, Table, open_table
+from accelcal_cli.io.reader import InputTable, RowBlock, open_table
 from accelcal_cli.io.readings import (
     LOOKED_AT,
     LabelledMeans,
@@ -273,7 +273,9 @@ class _FleetCollector:
     extras: RowStore | None = None
     origins: list[TableOrigin] = field(default_factory=list)
 
-    def read(self, table: Table, wanted: Sequence[str] | None, sensor: str | None, name: str | None) -> None:
+    def read(
+        self, table: InputTable, wanted: Sequence[str] | None, sensor: str | None, name: str | None
+    ) -> None:
         """Read one table: of the sensor `name`, or of many."""
         first = self.store.rows
         column = sensor_column(table, sensor) if name is None else own_sensor_column(table)
@@ -326,7 +328,7 @@ class _FleetCollector:
         self.extras.append(rows)
 
 
-def _only(table: Table, columns: Columns, rows: RowBlock, name: str) -> list[str]:
+def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> list[str]:
     """Return the name of a file's sensor for each row; more than one label in its sensor column is refused."""
     if columns.sensor is not None and len(set(rows.texts[0])) > 1:
         shown = (table.names or ())[columns.sensor]

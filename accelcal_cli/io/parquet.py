@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.reader import LIMIT, NO_LABEL, RowBlock, Selection, Table
+from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
 
@@ -143,7 +143,7 @@ def _named_errors(name: str) -> Iterator[None]:
         raise DataError(f"{name}: cannot be read as Parquet ({reason})") from problem
 
 
-def frames(table: Table, change: Change) -> Iterator[pl.DataFrame]:
+def frames(table: InputTable, change: Change) -> Iterator[pl.DataFrame]:
     """Yield the changed log, block after block."""
     assert isinstance(table, ParquetTable)
     for frame, rows in table.pairs(change.selection):
@@ -152,14 +152,14 @@ def frames(table: Table, change: Change) -> Iterator[pl.DataFrame]:
         yield change.put(frame, new)
 
 
-def to_text(table: Table, change: Change, file: IO[bytes]) -> None:
+def to_text(table: InputTable, change: Change, file: IO[bytes]) -> None:
     """Write the changed log as CSV."""
     for k, frame in enumerate(frames(table, change)):
         with system_errors():
             frame.write_csv(file, include_header=k == 0)
 
 
-def to_parquet(table: Table, change: Change, file: IO[bytes]) -> None:
+def to_parquet(table: InputTable, change: Change, file: IO[bytes]) -> None:
     """Write the changed log as Parquet, by the name of the file if it has one.
 
     Raises:

@@ -56,7 +56,7 @@ class RowBlock:
     texts: tuple[Sequence[str], ...] = ()
 
 
-class Table(Protocol):
+class InputTable(Protocol):
     """A table that can be read once, from top to bottom."""
 
     @property
@@ -90,7 +90,7 @@ class Table(Protocol):
         """Release the file."""
 
 
-def open_table(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> Table:
+def open_table(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> InputTable:
     """Open a table of any supported form; ``-`` is standard input. Without the hash it is read a little faster."""
     stream, path = open_source(source, stdin, hashed=hashed), None if str(source) == "-" else Path(source)
     try:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import LIMIT, RowBlock, Table, open_table
+from accelcal_cli.io.reader import LIMIT, InputTable, RowBlock, open_table
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 
 STUCK = 1_000_000
@@ -175,7 +175,7 @@ def read_readings(
         table.close()
 
 
-def check_rows(table: Table, columns: Columns, rows: RowBlock) -> None:
+def check_rows(table: InputTable, columns: Columns, rows: RowBlock) -> None:
     """Refuse counts that are not whole numbers of 1 or more, and standard deviations below zero."""
     for at, column in enumerate(columns.extras, 3):
         counts, values = column == columns.count, rows.numbers[:, at]

@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
-from accelcal_cli.detection.capture import NEAR, Capture, CapturedPose, Status
+from accelcal_cli.detection.capture import NEAR, Capture, CapturedPose, CaptureStatus
 from accelcal_cli.output.console import console
 from accelcal_cli.output.files import check_target, is_stream, open_stream, unwritten, whole_file
 from accelcal_cli.sensor.poses import describe
@@ -35,7 +35,7 @@ class Watch:
         """Watch a capture."""
         self.capture, self.quiet = capture, quiet
         self.out = console(sys.stderr)
-        self.status: Status | None = None
+        self.status: CaptureStatus | None = None
         live = not quiet and sys.stderr.isatty()
         self.live = Live(get_renderable=self._drawn, console=self.out, refresh_per_second=8) if live else None
 
@@ -57,7 +57,7 @@ class Watch:
             with suppress(OSError):  # a terminal that is gone shows nothing more
                 self.live.stop()
 
-    def see(self, status: Status) -> None:
+    def see(self, status: CaptureStatus) -> None:
         """Show what the sensor is doing now; a pose that was taken sounds the bell."""
         self.status = status
         if status.state != "taken" or self.quiet:
