@@ -142,7 +142,8 @@ def calibrate_fleet(
         **{f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(Fleet)}
     )
     if all(reason.startswith("--weights") for reason in fleet.reason):
-        raise DataError(f"{readings.source}: no sensor can be weighted: {fleet.reason[0].rstrip('.')}")
+        label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
+        raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
     return fleet
 
 

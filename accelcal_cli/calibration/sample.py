@@ -20,7 +20,7 @@ Blocks = Callable[[], Iterator[tuple[int, Float]]]
 
 NEEDS = {
     "n": 'a column "n" or repeated readings per pose',
-    "sd": "standard deviations above zero (columns sx, sy, sz) or at least two readings per pose",
+    "sd": 'a column "n" and standard deviations above zero (columns sx, sy, sz), or at least two readings per pose',
     "auto": "the number of readings and their standard deviation (columns n, sx, sy, sz), or at least two readings "
     "per pose",
 }

@@ -21,7 +21,8 @@ from accelcal_cli.io.readings import read_readings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.simulation import Sensor, Spread, draw
-from accelcal_cli.views.fleet import counts, sensors, summary
+from accelcal_cli.views.blocks import Table
+from accelcal_cli.views.fleet import blocks, counts, sensors
 
 G = 9.81
 LM = Settings(optimizer="levenberg-marquardt", g=G)
@@ -207,7 +208,7 @@ def test_weights_are_those_of_calibrate(tmp_path, weights):
 
 def test_weights_that_a_sensor_lacks_are_refused_with_its_name(tmp_path):
     path = write(tmp_path / "a.csv", {"left": rows_of(poses.turns(), 1)})
-    with pytest.raises(DataError, match='no sensor can be weighted: --weights n needs a column "n"'):
+    with pytest.raises(DataError, match='sensor "left", as all others: --weights n needs a column "n"'):
         calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="n"))
 
 
@@ -219,7 +220,7 @@ def test_a_sensor_that_gives_no_weights_fails_alone(tmp_path):
     path = write(tmp_path / "a.csv", {"left": rows, "right": without}, "sensor,ax,ay,az,n,sx,sy,sz")
     fleet = calibrate_fleet(read_fleet([path]), dataclasses.replace(LM, weights="sd"))
     assert fleet.verdict.tolist() == ["good", FAILED]
-    assert fleet.reason[1].startswith("--weights sd needs standard deviations above zero")
+    assert fleet.reason[1].startswith('--weights sd needs a column "n" and standard deviations above zero')
     alone = write(tmp_path / "b.csv", {"left": rows}, "sensor,ax,ay,az,n,sx,sy,sz")
     one = calibrate_fleet(read_fleet([alone]), dataclasses.replace(LM, weights="sd"))
     np.testing.assert_array_equal(fleet.K_a[0], one.K_a[0])
@@ -351,7 +352,9 @@ def test_a_broken_sensor_has_the_cautions_of_calibrate(clipped, tmp_path):
         assert fleet.caution[r] == " ".join(kept[r].cautions)
     assert "Outlier: line 295 does not fit the other poses" in fleet.caution[12]
     assert counts(fleet) == "30 sensors: 30 good, 2 of them with a caution"
-    (table,) = [t for t in summary(fleet, readings.sensors, [], G) if t.title == "Cautions"]
+    (table,) = [
+        t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table) and t.title == "Cautions"
+    ]
     assert [row[0] for row in table.rows] == ["S07", "S12"]
     assert table.rows[0][1] == pytest.approx(100 * fleet.s[7] / G)
     assert table.rows[0][3] == "Residuals are too large"
@@ -450,7 +453,7 @@ def test_the_summary_tells_what_is_wrong(mixed):
     path, _ = mixed
     readings = read_fleet([path])
     fleet = calibrate_fleet(readings, LM)
-    tables = {t.title: t for t in summary(fleet, readings.sensors, [], G)}
+    tables = {t.title: t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table)}
     assert list(tables) == ["Fleet", "Worst fit", "Cautions", "Not good"]
     first = tables["Not good"].rows[0]
     assert first[1] == FAILED
