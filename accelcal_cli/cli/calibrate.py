@@ -188,12 +188,12 @@ def _units_of_g(result: Calibration) -> str:
 
 
 def _check_output(output: str | None, format: str) -> None:
-    from accelcal_cli.output.files import is_stream
-
     if output == "-" and format != "table":
         raise UsageError(f"-o - prints the result file; leave out --format {format}")
     if output in (None, "-"):
         return
+    from accelcal_cli.output.files import is_stream
+
     if Path(output).suffix not in SUFFIXES and not is_stream(output) and not Path(output).is_dir():
         raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
 

@@ -447,16 +447,17 @@ def print_result(
         blocks: makes what people see.
         record: makes what json prints; the rows of the table when None.
     """
-    from accelcal_cli.output.machine import json_rows, json_text, write_csv
-
     if format == "table":
         from accelcal_cli.output.console import show
 
         show(blocks())
-    elif format == "json":
-        sys.stdout.write(json_text(record() if record else json_rows([table()])))
     else:
-        write_csv(table(), sys.stdout)
+        from accelcal_cli.output.machine import json_rows, json_text, write_csv
+
+        if format == "json":
+            sys.stdout.write(json_text(record() if record else json_rows([table()])))
+        else:
+            write_csv(table(), sys.stdout)
     sys.stdout.flush()
 
 
