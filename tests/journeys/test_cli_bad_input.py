@@ -6,6 +6,7 @@ import resource
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 RESULT = ("-o", "result.yaml")
 
@@ -239,17 +240,6 @@ def folder(good, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a.json").write_text("{}")
     return tmp_path
-
-
-def refused(outcome, parts):
-    """Check the exit code and the message."""
-    assert outcome.code == 2
-    assert outcome.out == ""
-    assert outcome.err.startswith("accelcal: ")
-    assert outcome.err.count("\n") == 1, outcome.err
-    assert len(outcome.err) < 500
-    for part in parts:
-        assert part in outcome.err
 
 
 @pytest.mark.parametrize("what", CALIBRATE)

@@ -9,6 +9,7 @@ import os
 from math import cos, sin
 
 import pytest
+from refusals import refused
 
 QUICK = ("compare", "--runs", "6", "--optimizer", "pso,levenberg-marquardt", "--iterations", "60", "--quiet")
 SMALL = ("reproduce", "dpso-figure2", "--runs", "1", "--quiet")
@@ -199,15 +200,6 @@ REPRODUCE = {
     "raw": (["dpso-table2", "--raw", "x.png"], ["x.png", ".csv or .parquet"]),
     "seed": (["dpso-table2", "--seed", "-1"], ["--seed"]),
 }
-
-
-def refused(outcome, parts):
-    assert outcome.code == 2
-    assert outcome.out == ""
-    assert outcome.err.startswith("accelcal: ")
-    assert outcome.err.count("\n") == 1, outcome.err
-    for part in parts:
-        assert part in outcome.err
 
 
 @pytest.fixture

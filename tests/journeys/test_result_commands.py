@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from refusals import refused
 
 from accelcal_cli.calibration.result import load_result
 
@@ -397,16 +398,6 @@ def folder(run, result, log, tmp_path):
     assert run("calibrate", "good.csv", "--g", G, "--gauge", "full", "-o", "full.yaml", "-q").code == 0
     assert run("simulate", "--sensor", "mems", "--attitude", "-o", "known.csv").code == 0
     return tmp_path
-
-
-def refused(outcome, parts):
-    assert outcome.code == 2
-    assert outcome.out == ""
-    assert outcome.err.startswith("accelcal: ")
-    assert outcome.err.count("\n") == 1, outcome.err
-    assert len(outcome.err) < 500
-    for part in parts:
-        assert part in outcome.err, outcome.err
 
 
 def test_every_command_refuses_a_bad_result(run, folder):
