@@ -10,7 +10,7 @@ from pathlib import Path
 PACKAGE = "accelcal_cli"
 
 GROUPS = (
-    ("errors", "arrays", "rng", "schema", "registry", "config"),
+    ("errors", "notices", "arrays", "rng", "schema", "registry", "config"),
     ("optimization", "sensor"),
     ("io",),
     ("calibration",),
