@@ -14,7 +14,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.distributions import chi_square_chance
 from accelcal_cli.calibration.fit import Fit
-from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Verdict, poses_to_add
+from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, poses_to_add
 from accelcal_cli.calibration.search import rounding
 
 FEWEST_KNOWN = 6

@@ -48,7 +48,7 @@ it, 1e-6, is the smallest relative difference between poses that an ordinary CSV
 ALIGNED = np.repeat([False, True, False], 3)
 """The parameters that are not estimated when the axes are taken as perpendicular."""
 
-Verdict = Literal["good", "weak", "undetermined"]
+PoseVerdict = Literal["good", "weak", "undetermined"]
 
 
 def design(u: Float) -> Float:
@@ -57,7 +57,7 @@ def design(u: Float) -> Float:
     return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
 
 
-def verdict_of(worst: float, rank: int, parameters: int = 9) -> Verdict:
+def verdict_of(worst: float, rank: int, parameters: int = 9) -> PoseVerdict:
     """Return the verdict on poses that determine `rank` directions, with this largest dilution of precision."""
     if rank < parameters or worst > UNDETERMINED:
         return "undetermined"
@@ -148,12 +148,12 @@ class Observability:
         return np.asarray(self.dop.max(axis=-1))
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> PoseVerdict:
         """Definition: undetermined above 25 or below full rank, weak above 10, good otherwise. One set of poses."""
         return verdict_of(float(self.worst), int(self.rank), len(self.names))
 
     @property
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[PoseVerdict]:
         """The verdict on each of R sets of poses."""
         return [
             verdict_of(worst, rank, len(self.names))
@@ -179,6 +179,17 @@ class Observability:
         """Return the names of the parameters whose bounded dilution is above `limit`, worst first. One set of poses."""
         order = np.argsort(-np.round(self.bounded, 3), kind="stable")
         return [self.names[i] for i in order if self.bounded[i] > limit]
+
+
+def moved_sensor(K: Float, D: Float, step: Float, g: float) -> tuple[Float, Float]:
+    """Return K, gauge `lower`, and D of sensors whose nine parameters change by a step, m/s^2, shape (R, 9).
+
+    K_A becomes (I + E) K_A, with the lower triangle E (times g) and the biases as force from the step.
+    """
+    E = np.zeros_like(K)
+    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+        E[:, i, j] = step[:, p] / g
+    return K @ np.linalg.inv(np.eye(3) + E), D + np.einsum("rii->ri", K) * step[:, BIAS]
 
 
 def directions_of(output: Float, model: ErrorModel) -> Float:

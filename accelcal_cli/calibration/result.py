@@ -23,7 +23,7 @@ from accelcal_cli.calibration.observability import (
     PARAMETERS,
     SCALE,
     UNDETERMINED,
-    Verdict,
+    PoseVerdict as Verdict,
 )
 from accelcal_cli.calibration.settings import LARGEST
 from accelcal_cli.config import parse_mapping, read_text

@@ -46,9 +46,11 @@ class Sample:
         lower, upper: least and greatest output of each axis, shape (R, 3), output units.
         blocks: the outputs, shape (R, B, 3) a block, output units.
         doubtful: whether `readings` has warnings, or might have, shape (R,).
+        labelled: whether a label makes each pose an attitude of its own, shape (R,).
         readings: of each sensor by its number, from 0: origin, names of the poses, notes and warnings of the reader.
         count: raw readings behind each pose, shape (R, J); scatter: standard deviation of one of them, shape
-            (R, J, 3), output units; NaN where not known, None where nothing tells.
+            (R, J, 3), output units; cross: covariances xy, xz, yz of one, shape (R, J, 3), output units squared; NaN
+            where not known, None where nothing tells.
         reference: known specific force, shape (R, J, 3), m/s^2; temperature: shape (R, J); None where there is none.
     """
 
@@ -57,9 +59,11 @@ class Sample:
     upper: Float
     blocks: Blocks
     doubtful: Bool
+    labelled: Bool
     readings: Callable[[int], Readings]
     count: Float | None = None
     scatter: Float | None = None
+    cross: Float | None = None
     reference: Float | None = None
     temperature: Float | None = None
 
@@ -85,9 +89,11 @@ class Sample:
             upper=np.stack([one.upper for one in readings]),
             blocks=blocks,
             doubtful=np.array([bool(one.cautions) for one in readings]),
+            labelled=np.array([one.labels is not None for one in readings]),
             readings=readings.__getitem__,
             count=stack("count"),
             scatter=stack("scatter"),
+            cross=stack("cross"),
             reference=stack("reference"),
             temperature=stack("temperature"),
         )
@@ -102,9 +108,11 @@ class Sample:
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
             doubtful=doubtful,
+            labelled=fleet.labelled(batch),
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
             scatter=batch.scatter,
+            cross=batch.cross,
         )
 
     def __len__(self) -> int:
@@ -124,7 +132,7 @@ class Sample:
         numbers = index.tolist()
         parts = {
             name: None if (value := getattr(self, name)) is None else value[index]
-            for name in ("count", "scatter", "reference", "temperature")
+            for name in ("count", "scatter", "cross", "reference", "temperature")
         }
         return replace(
             self,
@@ -133,6 +141,7 @@ class Sample:
             upper=self.upper[index],
             blocks=lambda: ((first, block[index]) for first, block in self.blocks()),
             doubtful=self.doubtful[index],
+            labelled=self.labelled[index],
             readings=lambda at: self.readings(numbers[at]),
             **parts,
         )
@@ -142,20 +151,19 @@ class Sample:
         lower, upper = output.min(axis=1), output.max(axis=1)
         return replace(self, lower=lower, upper=upper, blocks=lambda: iter([(0, output)]))
 
-    def weights(self, choice: Weights) -> Float | None:
-        """Return the weights of the poses, mean 1 per sensor, 0 for repetitions, shape (R, J), or None for all alike.
+    def counts(self, choice: Weights) -> Float | None:
+        """Return weights by how many raw readings a pose is the mean of, or None for all alike; see `normalised`.
 
-        n: how many raw readings a pose is the mean of; sd: those over the variance of one. Weights of a sensor whose
-        readings do not give them (see `without_weights`) mean nothing.
+        For choices other than `n` the poses count alike.
         """
         real = self.real(0, int(self.poses.max()))
-        if choice == "none" or self.count is None:
+        if choice != "n" or self.count is None:
             return None if real.all() else real.astype(float)
-        weights = self.count.astype(float)
-        if choice == "sd" and self.scatter is not None:
-            square = np.mean(self.scatter**2, axis=2)
-            weights = np.divide(weights, square, out=np.full(weights.shape, np.nan), where=square > 0)
-        weights = np.where(real, weights, 0.0)
+        return self.normalised(self.count)
+
+    def normalised(self, weights: Float) -> Float:
+        """Return weights, shape (R, J), with mean 1 per sensor and 0 for repetitions; NaN where one is not known."""
+        weights = np.where(self.real(0, weights.shape[1]), weights, 0.0)
         mean: Float = weights.sum(axis=1, keepdims=True) / self.poses[:, None]
         return weights / mean
 
@@ -172,20 +180,6 @@ class Sample:
             usable &= (choice == "auto") | (scatter > 0).any(axis=2)
         return np.asarray((~usable & self.real(0, count.shape[1])).any(axis=1))
 
-    def explained(self, first: int, f: Float, K: Float) -> Float:
-        """Return the variance of the modulus that the scatter of each pose explains, (m/s^2)^2, shape (R, B), or NaN.
-
-        Args:
-            first: number of the first of B poses; f: their specific force, m/s^2, shape (R, B, 3).
-            K: of the sensors, output units per m/s^2, shape (R, 3, 3).
-        """
-        if self.scatter is None or self.count is None:
-            return np.full(f.shape[:2], np.nan)
-        part = slice(first, first + f.shape[1])
-        u = f / np.linalg.norm(f, axis=2, keepdims=True)
-        force = self.scatter[:, part] / np.einsum("rii->ri", K)[:, None, :]
-        return np.asarray(np.sum((u * force) ** 2, axis=2) / self.count[:, part])
-
     def errors(self, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
         """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).
 
@@ -197,14 +191,23 @@ class Sample:
             f = K_A @ np.subtract(block.swapaxes(1, 2), D[..., None], order="C")
             yield first, (g * g - np.einsum("rij,rij->rj", f, f)) / (2.0 * g), f.swapaxes(1, 2)
 
-    def noise(self, K: Float, D: Float, g: float) -> Float:
-        """Return a robust standard deviation of e, m/s^2, shape (R,): its median absolute value times 1.4826."""
+    def noise(self, K: Float, D: Float, g: float, weights: Float | None) -> Float:
+        """Return a robust standard deviation of sqrt(w) e, m/s^2, shape (R,): 1.4826 times the median absolute value.
+
+        Poses with weight 0 do not count.
+        """
         poses = int(self.poses.max())
         stride = max(1, poses // SCALE_SAMPLE)
-        sizes = [np.abs(e)[:, (-first) % stride :: stride] for first, e, _ in self.errors(K, D, g)]
+        sizes = []
+        for first, e, _ in self.errors(K, D, g):
+            part = slice((-first) % stride, None, stride)
+            root = np.ones_like(e) if weights is None else np.sqrt(weights[:, first : first + e.shape[1]])
+            sizes.append(np.where(root > 0, np.abs(root * e), np.nan)[:, part])
+        size = np.concatenate(sizes, axis=1)
+        counted = np.count_nonzero(~np.isnan(size), axis=1) * (poses / size.shape[1])
         # Nine parameters follow the smallest residuals: the factor gives the scale back what they took.
-        freedom = max(1.0, poses - 9.0) / poses
-        return np.asarray(NORMAL_MAD * np.median(np.concatenate(sizes, axis=1), axis=1) / np.sqrt(freedom))
+        freedom = np.maximum(1.0, counted - 9.0) / counted
+        return np.asarray(NORMAL_MAD * np.nanmedian(size, axis=1) / np.sqrt(freedom))
 
     def reweighted(
         self, K: Float, D: Float, settings: Settings, noise: Float, weights: Float | None

@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK, moved_sensor
 from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.search import SLOPES, Slopes, Solution
+from accelcal_cli.calibration.search import SHARED_ROUNDS, SHARED_SETTLED, SLOPES, Slopes, Solution, share
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
 SMALLEST_RANGE = 5.0
@@ -37,7 +37,9 @@ def with_slopes(solution: Solution) -> Solution:
         return solution
     degrees = sample.temperature[0]
     why = _unsuitable(solution, degrees)
-    slopes = None if why else _fit(solution, degrees)
+    slopes = None
+    if not why:
+        solution, slopes = _settled(solution, degrees)
     if slopes is None:
         why = why or "the poses do not determine slopes with temperature"
         return replace(solution, notes=(*solution.notes, f"Temperature column not used: {why}."))
@@ -46,6 +48,25 @@ def with_slopes(solution: Solution) -> Solution:
     middle = slopes.temperature.reference
     note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
     return replace(solution.solved_anew(cost), plain=cost, slopes=slopes, notes=(*solution.notes, note))
+
+
+def _settled(solution: Solution, degrees: Float) -> tuple[Solution, Slopes | None]:
+    """Return the solution with the weights that go with slopes, and these: an error that poses share is what is left."""
+    slopes = _fit(solution, degrees)
+    if slopes is None or solution.stated.settings.weights != "auto" or solution.stated.noise is None:
+        return solution, slopes
+    stated = solution.stated.with_weights(solution.stated.sample.normalised(1.0 / solution.stated.noise.variance))
+    stated, before = replace(stated, own=None), -1.0
+    for _ in range(SHARED_ROUNDS):
+        solution = replace(solution, stated=stated)
+        slopes = _fit(solution, degrees)
+        if slopes is None:
+            return solution, None
+        stated, shared = share(stated, slopes.sample, slopes.sensor, 9 + SLOPES)
+        if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
+            break
+        before = shared
+    return replace(solution, stated=stated), _fit(replace(solution, stated=stated), degrees)
 
 
 def _fit(solution: Solution, degrees: Float) -> Slopes | None:
@@ -76,8 +97,19 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
         middle, float(degrees.min()), float(degrees.max()), scale, bias, sigma_scale, sigma_bias, dop
     )
     B, C = information[:9, 9:], information[9:, 9:]
-    brought = temperature.at_reference(N, degrees, _moved(low, p, g).D)
-    return Slopes(temperature, sample.with_output(brought[None]), (B @ np.linalg.solve(C, B.T))[None])
+    sensor = _moved(low, p, g)
+    brought = temperature.at_reference(N, degrees, sensor.D)
+    part = np.linalg.solve(C, B.T)
+    # What the slopes' columns take from those of the nine parameters does not determine these.
+    rows = np.column_stack([J[:, :9] - J[:, 9:] @ part, J[:, 9:]])
+    return Slopes(
+        temperature,
+        sample.with_output(brought[None]),
+        (B @ part)[None],
+        (sensor.K[None], sensor.D[None]),
+        rows[None],
+        np.linalg.inv(C)[None],
+    )
 
 
 def _unsuitable(solution: Solution, degrees: Float) -> str:
@@ -100,10 +132,8 @@ def _unsuitable(solution: Solution, degrees: Float) -> str:
 
 def _moved(low: ErrorModel, p: Float, g: float) -> ErrorModel:
     """Return the sensor of gauge `lower` at the first nine parameters, m/s^2."""
-    E = np.zeros((3, 3))
-    for value, (i, j) in zip(p[:6], ROWS_COLUMNS[:6], strict=True):
-        E[i, j] = value / g
-    return ErrorModel(low.K @ np.linalg.inv(np.eye(3) + E), low.D + np.diagonal(low.K) * p[6:9])
+    K, D = moved_sensor(low.K[None], low.D[None], p[None, :9], g)
+    return ErrorModel(K[0], D[0])
 
 
 def _linearised(N: Float, t: Float, low: ErrorModel, p: Float, g: float) -> tuple[Float, Float]:

@@ -66,6 +66,11 @@ class TableOrigin:
     timed: bool
 
 
+EXTRAS = 0, slice(1, 4), slice(4, 7)
+"""Where the store of what is known beside the output has the readings behind a pose, their standard deviations, and
+their covariances."""
+
+
 @dataclass(frozen=True, eq=False)
 class Batch:
     """The poses of R sensors as arrays of one length J; a sensor with fewer repeats its last pose.
@@ -74,7 +79,8 @@ class Batch:
         sensors: their numbers, shape (R,); count: poses of each, shape (R,).
         output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
         behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
-        scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise.
+        scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise; cross: covariances xy, xz
+            and yz of one, shape (R, J, 3), sensor units squared, likewise.
     """
 
     sensors: Int
@@ -83,6 +89,7 @@ class Batch:
     pose: Int
     behind: Float | None = None
     scatter: Float | None = None
+    cross: Float | None = None
 
     @property
     def real(self) -> Bool:
@@ -130,6 +137,7 @@ class FleetReadings:
             source=f'{origin.name}, sensor "{name}"',
             count=_known(batch.behind, at, count),
             scatter=_known(batch.scatter, at, count),
+            cross=_known(batch.cross, at, count),
         ).known_as(
             origin.sha256,
             origin.columns,
@@ -144,6 +152,12 @@ class FleetReadings:
         first, span = output[:LOOKED_AT], float(np.ptp(output, axis=0).max())
         log = log_cautions(len(output), first, span, timed=origin.timed) if origin.rows else ()
         return (*log, *doubts(first, origin.columns))
+
+    def labelled(self, batch: Batch) -> Bool:
+        """Return which sensors of a batch have poses that a label made, shape (R,)."""
+        if len({origin.rows for origin in self.origins}) == 1:
+            return np.full(len(batch.sensors), not self.origins[0].rows)
+        return np.array([not self.origin(pose).rows for pose in batch.pose[:, 0].tolist()])
 
     def batches(self) -> Iterator[Batch]:
         """Yield every sensor once, in batches of about equally many poses."""
@@ -171,8 +185,7 @@ class FleetReadings:
                 counts[index],
                 rows[at, 1:],
                 pose[at],
-                None if extras is None else extras[at, 0],
-                None if extras is None else extras[at, 1:],
+                *(None if extras is None else extras[at][..., part] for part in EXTRAS),
             )
 
     def _select(self, first: int, last: int) -> tuple[Float, Int]:
@@ -297,7 +310,7 @@ class _FleetCollector:
                 means.add(list(zip(codes.tolist(), rows.texts[-1], strict=True)), output, count, scatter)
         if means is not None:
             codes = np.array([code for code, _ in means.index], dtype=np.intp)
-            self._add(codes, means.mean, means.count(), means.scatter())
+            self._add(codes, means.mean, means.count(), means.scatter(), means.cross())
         self.origins.append(
             TableOrigin(
                 table.name,
@@ -311,7 +324,14 @@ class _FleetCollector:
             )
         )
 
-    def _add(self, codes: Int, output: Float, behind: Float | None, scatter: Float | None) -> None:
+    def _add(
+        self,
+        codes: Int,
+        output: Float,
+        behind: Float | None,
+        scatter: Float | None,
+        cross: Float | None = None,
+    ) -> None:
         """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""
         before = self.store.rows
         self.poses = np.pad(self.poses, (0, len(self.index) - len(self.poses)))
@@ -320,11 +340,11 @@ class _FleetCollector:
         if behind is None and scatter is None and self.extras is None:
             return
         if self.extras is None:
-            self.extras = RowStore(4)
-            self.extras.append(np.full((before, 4), np.nan))
-        rows = np.empty((len(codes), 4))
-        rows[:, 0] = np.nan if behind is None else behind
-        rows[:, 1:] = np.nan if scatter is None else scatter
+            self.extras = RowStore(7)
+            self.extras.append(np.full((before, 7), np.nan))
+        rows = np.empty((len(codes), 7))
+        for part, values in zip(EXTRAS, (behind, scatter, cross), strict=True):
+            rows[:, part] = np.nan if values is None else values
         self.extras.append(rows)
 
 

@@ -56,6 +56,7 @@ class Readings:
         labels: of the poses; None where each row is a pose.
         count: raw readings behind each pose, shape (J,).
         scatter: standard deviation of one raw reading, shape (J, 3), sensor units, NaN if unknown.
+        cross: covariances xy, xz and yz of one raw reading, shape (J, 3), sensor units squared, NaN if unknown.
         reference: known specific force, shape (J, 3), m/s^2 or g as given.
         temperature: shape (J,), as given, NaN where missing.
         notes: what the reader did that a user should know.
@@ -71,6 +72,7 @@ class Readings:
     labels: tuple[str, ...] | None = None
     count: Float | None = None
     scatter: Float | None = None
+    cross: Float | None = None
     reference: Float | None = None
     temperature: Float | None = None
     notes: tuple[str, ...] = ()
@@ -100,6 +102,7 @@ class Readings:
         labels: Sequence[str] | None = None,
         count: ArrayLike | None = None,
         scatter: ArrayLike | None = None,
+        cross: ArrayLike | None = None,
         reference: ArrayLike | None = None,
         temperature: ArrayLike | None = None,
     ) -> Readings:
@@ -122,6 +125,7 @@ class Readings:
             labels=None if labels is None else tuple(map(str, labels)),
             count=numbers,
             scatter=None if scatter is None else _array("scatter", scatter, 3, poses, gaps=True),
+            cross=None if cross is None else _array("cross", cross, 3, poses, gaps=True),
             reference=None if reference is None else _array("reference", reference, 3, poses),
             temperature=(
                 None if temperature is None else _array("temperature", temperature, 1, poses, gaps=True)[:, 0]
@@ -232,8 +236,9 @@ class Collector:
         """
         columns, means = self.columns, self._means
         extras: tuple[Float | None, Float | None, Float | None] = (None, None, None)
+        cross = None
         if means is not None:
-            extras = means.count(), means.scatter(), means.mean[:, 3:]
+            extras, cross = (means.count(), means.scatter(), means.mean[:, 3:]), means.cross()
             self._take_means(means)
         elif self._extras:
             extras = columns.split(np.concatenate(self._extras))
@@ -252,6 +257,7 @@ class Collector:
             None if means is None else tuple(means.index),
             count,
             scatter,
+            cross,
             reference=None if others is None or columns.reference is None else others[:, :3],
             temperature=None if others is None or columns.temperature is None else others[:, -1],
             notes=tuple(self.notes),
@@ -298,7 +304,8 @@ class LabelledMeans(Generic[Label]):
     Attributes:
         index: number of each label, in order of first occurrence.
         rows, weight: table rows and raw readings of each label, shape (J,).
-        mean: shape (J, width); square: weighted sum of squares about the mean, shape (J, 3).
+        mean: shape (J, width); square: weighted sum of squares about the mean, shape (J, 3); product: of products xy,
+            xz and yz, shape (J, 3).
         spread: standard deviation stated by the label's last row, shape (J, 3), sensor units.
     """
 
@@ -309,6 +316,7 @@ class LabelledMeans(Generic[Label]):
         self.index: dict[Label, int] = {}
         self.rows, self.weight = np.zeros(0), np.zeros(0)
         self.mean, self.square, self.spread = np.zeros((0, width)), np.zeros((0, 3)), np.zeros((0, 3))
+        self.product = np.zeros((0, 3))
         self.weighted = self.spreads = False
 
     def add(
@@ -337,6 +345,7 @@ class LabelledMeans(Generic[Label]):
         present = fresh > 0
         total = self.weight + fresh
         share = np.divide(fresh, total, out=np.zeros_like(total), where=present)
+        apart, steps = [], []
         for k in range(rows.shape[1]):
             mean = np.divide(
                 _sums(codes, weight * shifted[:, k], len(fresh)),
@@ -346,9 +355,14 @@ class LabelledMeans(Generic[Label]):
             )
             step = np.where(present, origin[k] + mean - self.mean[:, k], 0.0)
             if k < 3:
-                inner = _sums(codes, weight * (shifted[:, k] - mean[codes]) ** 2, len(fresh))
+                apart.append(shifted[:, k] - mean[codes])
+                steps.append(step)
+                inner = _sums(codes, weight * apart[k] ** 2, len(fresh))
                 self.square[:, k] += inner + step**2 * self.weight * share
             self.mean[:, k] += step * share
+        for p, (i, j) in enumerate(PAIRS):
+            inner = _sums(codes, weight * apart[i] * apart[j], len(fresh))
+            self.product[:, p] += inner + steps[i] * steps[j] * self.weight * share
         self.weight = total
 
     def _grow(self, size: int) -> None:
@@ -357,9 +371,9 @@ class LabelledMeans(Generic[Label]):
         more = size - len(self.rows)
         if more:
             self.rows, self.weight = (np.append(old, np.zeros(more)) for old in (self.rows, self.weight))
-            self.mean, self.square, self.spread = (
+            self.mean, self.square, self.product, self.spread = (
                 np.vstack([old, np.zeros((more, old.shape[1]))])
-                for old in (self.mean, self.square, self.spread)
+                for old in (self.mean, self.square, self.product, self.spread)
             )
 
     @property
@@ -379,6 +393,16 @@ class LabelledMeans(Generic[Label]):
         single = np.full_like(self.spread, np.nan) if not self.spreads else self.spread
         pooled = np.sqrt(np.divide(self.square, freedom, out=np.zeros_like(self.square), where=freedom > 0))
         return np.where(self.rows[:, None] > 1, pooled, single)
+
+    def cross(self) -> Float | None:
+        """Return the covariances xy, xz and yz of one raw reading (J, 3), sensor units squared; NaN where unknown.
+
+        None where a row states standard deviations: those say nothing of how the axes go together.
+        """
+        if self.spreads or not self.repeated:
+            return None
+        freedom = self.rows[:, None] - 1
+        return np.divide(self.product, freedom, out=np.full_like(self.product, np.nan), where=freedom > 0)
 
 
 def number_labels(index: dict[Label, int], labels: Sequence[Label]) -> Int:
