@@ -11,9 +11,10 @@ from dataclasses import asdict
 import numpy as np
 
 from accelcal_cli import __version__
+from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.sample import NEEDS, Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
@@ -112,7 +113,9 @@ def record(assessment: Assessment, at: int) -> Calibration:
     fit = assessment.fit
     settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
     model = ErrorModel(fit.K[at], fit.D[at])
-    ratio, chance = (None if np.isnan(v) else v for v in fit.noise[:, at].tolist())
+    factor = float(fit.coverage[at])
+    noise = (float(fit.spread.ratio[at]), float(fit.spread.p_more[at]))
+    ratio, chance = (None if np.isnan(v) else v for v in noise)
     return Calibration(
         K_a=model.K,
         D_a=model.D,
@@ -120,11 +123,14 @@ def record(assessment: Assessment, at: int) -> Calibration:
         f_0=model.f_0,
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
-        dop=Dop.of(fit.dop[at]),
+        interval=NO_INTERVAL,
+        coverage_factor=None,
+        dop=Dop.of(fit.view.dop[at]),
+        geometry=Dop.of(_nine_of(fit.geometry.observability.dop[at], fit.view.dop[at])),
         verdict=assessment.verdicts[at],
         reasons=assessment.reasons[at],
         suggestions=assessment.suggestions[at],
-        cautions=assessment.cautions[at],
+        warnings=assessment.warnings[at],
         cost_search=float(search.cost[at]),
         cost=float(fit.value[at]),
         rms=float(fit.rms[at]),
@@ -132,13 +138,14 @@ def record(assessment: Assessment, at: int) -> Calibration:
         before=fit.before[at],
         s=float(fit.s[at]),
         freedom=int(fit.freedom[at]),
-        noise_ratio=ratio,
-        noise_chance=chance,
+        residual_noise_ratio=ratio,
+        residual_noise_p=chance,
         covariance=fit.covariance[at],
         information=fit.information[at],
         nominal_scale=np.array(fit.nominal[at]),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=int(fit.sample.poses[at]),
+        attitudes=int(fit.geometry.attitudes[at]),
         evaluations=int(search.evaluations[at]),
         runs=search.runs,
         runs_agreeing=int(search.agreeing[at]),
@@ -152,7 +159,12 @@ def record(assessment: Assessment, at: int) -> Calibration:
         notes=_notes(assessment, at),
         version=__version__,
         temperature=fit.temperature,
-    )
+    ).with_intervals(factor)
+
+
+def _nine_of(geometry: Float, view: Float) -> Float:
+    """Return the dilution of precision of nine parameters by the geometry; with known attitudes it has four columns."""
+    return geometry if len(geometry) == len(view) else view
 
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:

@@ -1,9 +1,9 @@
-"""Which poses agree: a start for robust losses that gross errors do not reach, and the names of the poses that disagree.
+"""Which poses agree: a start for robust losses that gross errors do not reach, and the names of those that do not.
 
 Up to a quarter of the poses may be wrong by any factor. Ellipsoids through random subsets of the poses are each judged
-by the smaller three quarters of their squared residuals; the best are refined by fitting those poses again until nothing
-changes (least trimmed squares with concentration steps [rousseeuw2006]). From the best one the agreeing poses grow: a
-pose that the others would not call an outlier joins them.
+by the smaller three quarters of their squared residuals; the best are refined by fitting those poses again until
+nothing changes (least trimmed squares with concentration steps [rousseeuw2006]). From the best one the agreeing poses
+grow: a pose that the others would not call an outlier joins them.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _terms(x: Float) -> Float:
 
 
 def _solved(terms: Float, member: Float) -> Float:
-    """Return the quadrics y, shape (M, p), with terms . y = 1 for the members, 0 or 1, shape (M, J); NaN where singular."""
+    """Return the quadrics y, shape (M, p), with terms . y = 1 for the members, 0 or 1, shape (M, J)."""
     normal = (terms.T[None] * member[:, None]) @ terms
     right = member @ terms
     size = np.einsum("mpp->m", normal)
@@ -106,7 +106,7 @@ def _errors(terms: Float, y: Float) -> Float:
     A[:, [0, 1, 2], [0, 1, 2]] = y[:, :3]
     if p == 9:
         A[:, [0, 0, 1], [1, 2, 2]] = A[:, [1, 2, 2], [0, 0, 1]] = y[:, 3:6]
-    finite = np.isfinite(y).all(axis=1)
+    finite = np.asarray(np.isfinite(y).all(axis=1))
     values = np.linalg.eigvalsh(np.where(finite[:, None, None], A, np.eye(3)))
     sound = finite & (values[:, 0] > 1e-9 * values[:, 2])
     solved = np.linalg.solve(np.where(sound[:, None, None], A, np.eye(3)), m[..., None])[..., 0]

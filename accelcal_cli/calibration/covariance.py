@@ -2,9 +2,9 @@
 
 Without more knowledge every pose has the same noise, known from the residuals, and the covariance is s^2 (A^T W A)^-1.
 
-- Scatter within the poses says how the noise differs between them: pose j has the variance m^2 + v_j, v_j by its scatter
-  and m^2, the same for all, what the residuals leave beyond that. The covariance is then C A^T W V W A C, its degrees of
-  freedom are those of s^2 [satterthwaite1946].
+- Scatter within the poses says how the noise differs between them: pose j has the variance m^2 + v_j, v_j by its
+  scatter and m^2, the same for all, what the residuals leave beyond that. The covariance is then C A^T W V W A C, its
+  degrees of freedom are those of s^2 [satterthwaite1946].
 - Rows that follow each other are not independent: their residuals are summed over attitudes or blocks of time, and the
   covariance rests on how these sums scatter (CR2, with the degrees of freedom of [bell2002]).
 
@@ -26,8 +26,8 @@ FEWEST_ROWS = 40
 """Rows from which on it can be told that they follow each other."""
 
 SURELY_CORRELATED, LEAST_CORRELATION = 4.0, 0.1
-"""Standard deviations of the lag-1 autocorrelation of independent residuals beyond which they are not (1 in 30 000), and
-the least autocorrelation that matters: it widens an interval by a tenth."""
+"""Standard deviations of the lag-1 autocorrelation of independent residuals beyond which they are not (1 in 30 000),
+and the least autocorrelation that matters: it widens an interval by a tenth."""
 
 JUMP = 5.0
 """Degrees between two rows from which on the second is another attitude."""
@@ -116,10 +116,10 @@ def _satterthwaite(v: Float, w: Float, rows: Float, cofactor: Float, leverage: F
 def noise_bias(u: Float, w: Float, covariance: Float, cofactor: Float, g: float) -> Float:
     """Return what noise adds to the nine parameters, m/s^2, shape (R, 9), to second order.
 
-    With a row a of the design the fit solves sum w a e = 0. Noise n of a pose adds to e = -u n - |n|^2 / 2g and turns a,
+    With a row a of the design the fit solves sum w a e = 0. Noise n of a pose makes e = -u n - |n|^2 / 2g and turns a,
     whose entries are -u_i u_j and u_k, so that E[a e] = -tr V / 2g a + (u_i (V u)_j + u_j (V u)_i) / g and
-    -(V u)_k / g, with the covariance V of n. Noise alike in all directions gives 3.5 (s/g)^2 on each scale factor where
-    the directions balance.
+    -(V u)_k / g, with the covariance V of n. Noise alike in all directions gives 3.5 (s/g)^2 on each scale factor
+    where the directions balance.
 
     Args:
         u: unit directions, shape (R, J, 3); w: weights, shape (R, J).
@@ -148,6 +148,12 @@ def isotropic_bias(ones: Float, variance: Float, cofactor: Float, g: float) -> F
     return np.asarray((variance / g)[:, None] * (cofactor @ (factor * ones)[..., None])[..., 0])
 
 
+def jumps(u: Float, last: Float | None) -> Bool:
+    """Return which rows have another attitude than the one before, shape (B,); `last` came before the first."""
+    before = np.concatenate([u[:1] if last is None else last[None], u[:-1]])
+    return np.asarray(np.einsum("ja,ja->j", u, before) < np.cos(np.radians(JUMP)))
+
+
 @dataclass(eq=False)
 class Clusters:
     """Sums over the rows of one sensor that belong together, in the order of the rows and in constant memory.
@@ -156,24 +162,24 @@ class Clusters:
 
     Attributes:
         length: rows of a cluster at most.
-        information: A^T A of each, shape (C, 9, 9); score: A^T e of each, shape (C, 9).
+        information: A^T W A of each, shape (C, 9, 9); score: A^T W e of each, and ones: A^T W 1, shape (C, 9).
     """
 
     length: int
     information: Float = field(default_factory=lambda: np.zeros((0, 9, 9)))
     score: Float = field(default_factory=lambda: np.zeros((0, 9)))
+    ones: Float = field(default_factory=lambda: np.zeros((0, 9)))
     _last: Float | None = None
     _open: int = 0
 
     @classmethod
-    def of(cls, rows: int) -> Clusters:
-        """Return clusters for so many rows, at most half of MOST_CLUSTERS where no attitude jumps."""
-        return cls(-(-2 * rows // MOST_CLUSTERS))
+    def of(cls, rows: int, jumps: int) -> Clusters:
+        """Return clusters for so many rows: the attitudes where they jump often enough, else blocks of time."""
+        return cls(rows if jumps >= FEWEST_CLUSTERS else -(-2 * rows // MOST_CLUSTERS))
 
     def add(self, u: Float, scaled: Float, w: Float) -> None:
         """Add rows: unit directions, shape (B, 3), sqrt(w) e and w, shape (B,)."""
-        before = np.concatenate([u[:1] if self._last is None else self._last[None], u[:-1]])
-        jump = np.einsum("ja,ja->j", u, before) < np.cos(np.radians(JUMP))
+        jump = jumps(u, self._last)
         since = np.arange(len(u)) + self._open
         start = np.maximum.accumulate(np.where(jump, since, 0))
         begins = jump | ((since - start) % self.length == 0)
@@ -185,12 +191,14 @@ class Clusters:
         outer = np.add.reduceat((rows[:, :, None] * rows[:, None, :]).reshape(len(u), 81), cuts, axis=0)
         information = outer.reshape(-1, 9, 9)
         score = np.add.reduceat(rows * scaled[:, None], cuts, axis=0)
+        ones = np.add.reduceat(rows * np.sqrt(w)[:, None], cuts, axis=0)
         if head and len(self.score):
             self.information[-1] += information[0]
             self.score[-1] += score[0]
-            information, score = information[1:], score[1:]
+            self.ones[-1] += ones[0]
+            information, score, ones = information[1:], score[1:], ones[1:]
         self.information = np.concatenate([self.information, information])
-        self.score = np.concatenate([self.score, score])
+        self.score, self.ones = np.concatenate([self.score, score]), np.concatenate([self.ones, ones])
         self._last, self._open = u[-1], int(since[-1] - start[-1]) + 1 if len(at) else self._open + len(u)
         while len(self.score) > MOST_CLUSTERS:
             self._merge()
@@ -199,7 +207,7 @@ class Clusters:
     def _merge(self) -> None:
         pairs = np.arange(0, len(self.score), 2)
         self.information = np.add.reduceat(self.information, pairs, axis=0)
-        self.score = np.add.reduceat(self.score, pairs, axis=0)
+        self.score, self.ones = (np.add.reduceat(part, pairs, axis=0) for part in (self.score, self.ones))
 
     def spread(self, cofactor: Float) -> tuple[Float, float, int]:
         """Return the covariance of the parameters, shape (9, 9), its degrees of freedom, and the number of clusters.
@@ -211,7 +219,7 @@ class Clusters:
         """
         while len(self.score) >= 2 * FEWEST_CLUSTERS and self._correlated(cofactor):
             self._merge()
-        return *_cr2(self.information, self.score, cofactor), len(self.score)
+        return *_cr2(self, cofactor), len(self.score)
 
     def _correlated(self, cofactor: Float) -> bool:
         """Whether the contributions of neighbours to the estimates go together beyond chance."""
@@ -221,28 +229,28 @@ class Clusters:
         return bool(lag * np.sqrt(len(z)) > 1.0)
 
 
-def _cr2(information: Float, score: Float, cofactor: Float) -> tuple[Float, float]:
+def _cr2(clusters: Clusters, cofactor: Float) -> tuple[Float, float]:
     """Return the bias-reduced sandwich of clusters and its degrees of freedom [bell2002].
 
     With H_c the part of the hat matrix of cluster c, A_c^T (I - H_c)^-1/2 e_c = (I - G_c C)^-1/2 A_c^T e_c: everything
-    happens in the space of the parameters. The degrees of freedom are the mean over the parameters.
+    happens in the space of the parameters. The degrees of freedom are those under an error that the rows of a cluster
+    share, the mean over the parameters.
     """
     free = np.flatnonzero(np.diagonal(cofactor) > 0)
-    C = cofactor[np.ix_(free, free)]
-    root = np.linalg.cholesky(C)
+    root = np.linalg.cholesky(cofactor[np.ix_(free, free)])
     # In coordinates where C is the identity G_c C is symmetric.
-    G = root.T @ information[:, free[:, None], free] @ root
+    G = root.T @ clusters.information[:, free[:, None], free] @ root
     values, vectors = np.linalg.eigh(G)
     inverse = (vectors / np.sqrt(np.maximum(1.0 - values, 1e-3))[:, None, :]) @ vectors.swapaxes(1, 2)
-    z = (inverse @ (score[:, free] @ root)[..., None])[..., 0]
+    z = (inverse @ (clusters.score[:, free] @ root)[..., None])[..., 0]
     covariance = np.zeros_like(cofactor)
     covariance[np.ix_(free, free)] = root @ (z.T @ z) @ root.T
-    freedoms = []
+    ones, freedoms = clusters.ones[:, free] @ root, []
     for row in root:
         v = inverse @ row  # (C, p)
-        Gv = (G @ v[..., None])[..., 0]
-        B = -Gv @ Gv.T
-        B[np.diag_indices(len(B))] += np.sum(v * Gv, axis=1)
+        felt = -(G @ v[..., None])[..., 0] @ ones.T  # of the error of each cluster in the part of each
+        felt[np.diag_indices(len(felt))] += np.sum(ones * v, axis=1)
+        B = felt @ felt.T
         freedoms.append(np.trace(B) ** 2 / np.sum(B * B))
     return covariance, float(np.mean(freedoms))
 

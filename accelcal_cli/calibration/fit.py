@@ -17,11 +17,12 @@ from accelcal_cli.calibration.covariance import (
     Spread,
     autocorrelated,
     isotropic_bias,
+    jumps,
     noise_bias,
     plain_spread,
     scattered_spread,
 )
-from accelcal_cli.calibration.distributions import f_chance
+from accelcal_cli.calibration.distributions import f_chance, student_quantile
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     Observability,
@@ -41,12 +42,15 @@ from accelcal_cli.sensor.model import Gauge, to_gauge
 EDGE = 1e-6
 """A parameter within this part of a half-width from the wall of its box is at the edge."""
 
+COVERAGE = 0.95
+"""Part of the intervals that hold the true value."""
+
 NOTABLE_BIAS = 0.05
 """Sigmas of a parameter from which on the noise bias is taken off."""
 
 KNOWN_BIAS, SUPPOSED_BIAS = 0.1, 0.4
-"""Part of the noise bias that may remain: of noise known from repeated readings the formula is right to a tenth; that of
-single readings is supposed to be alike on all axes."""
+"""Part of the noise bias that may remain: of noise known from repeated readings the formula is right to a tenth; that
+of single readings is supposed to be alike on all axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,7 @@ class Fit:
         s: standard deviation of one pose's modulus (with known attitudes of one axis), m/s^2, NaN without freedom,
             shape (R,).
         covariance: of the nine parameters, (m/s^2)^2, shape (R, 9, 9), NaN where it does not hold.
+        coverage: factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`.
         bias: what may remain of the noise bias, m/s^2, shape (R, 9); see `_unbiased`.
         clusters: rows that follow each other are summed over so many clusters, shape (R,); 0 where they do not.
         at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
@@ -95,6 +100,7 @@ class Fit:
     spread: Spread
     s: Float
     covariance: Float
+    coverage: Float
     bias: Float
     clusters: Int
     at_wall: Bool
@@ -108,12 +114,19 @@ class Fit:
 
     @property
     def temperature(self) -> Temperature | None:
-        """The slopes with temperature, where there are any."""
-        return (
-            None
-            if self.solution is None or self.solution.slopes is None
-            else self.solution.slopes.temperature
-        )
+        """The slopes with temperature, where there are any, with their intervals; of one sensor."""
+        if self.solution is None or self.solution.slopes is None:
+            return None
+        return self.solution.slopes.temperature.with_intervals(float(self.coverage[0]))
+
+
+def coverage_of(freedom: Float) -> Float:
+    """Return the coverage factors of 95 % intervals, Student's t [gum2008], shape (R,); NaN below one of freedom.
+
+    Here a sigma and its degrees of freedom, shape (R,), meet: whole or not, they are those of the sigma that is stated.
+    """
+    factors = {n: student_quantile(0.5 + 0.5 * COVERAGE, n) for n in set(freedom.tolist()) if n >= 1}
+    return np.array([factors.get(n, np.nan) for n in freedom.tolist()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +164,10 @@ def fit(solution: Solution) -> Fit:
     )
     spread, clusters = _spread(solution, point, sums)
     at_wall, shown = _at_wall(solution.x), to_gauge(point.K, settings.gauge)
-    view, information, sight = _first_sight(solution, observability, point.information, (point.lower, point.D))
-    geometry = _geometry(solution, view, information, sight, held)
+    view, information, sight = _first_sight(
+        solution, observability, point.information, (point.lower, point.D)
+    )
+    geometry = _geometry(solution, information, sight, held)
     verdicts, walled = geometry.observability.verdicts, np.asarray(at_wall.any(axis=1))
     covariance = _covariance(observability, verdicts, spread, walled, g)
     sigma_K, sigma_D = propagate(shown, point.lower, covariance, settings.gauge, g)
@@ -175,6 +190,7 @@ def fit(solution: Solution) -> Fit:
         spread=spread,
         s=np.sqrt(spread.variance),
         covariance=covariance,
+        coverage=coverage_of(spread.freedom),
         bias=point.bias,
         clusters=clusters,
         at_wall=at_wall,
@@ -278,9 +294,13 @@ def _by_own(spread: Spread, own: tuple[float, int], freedom: Float) -> Spread:
 def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
     """Return the sums over rows of one sensor that follow each other."""
     sample, weights = solution.sample.take(np.array([at])), solution.stated.weights
-    clusters = Clusters.of(int(sample.poses[0]))
-    place = slice(at, at + 1)
-    for first, e, f in sample.errors(point.lower[place], point.D[place], solution.stated.settings.g):
+    place, last, count = slice(at, at + 1), None, 0
+    sensor = point.lower[place], point.D[place], solution.stated.settings.g
+    for _, _, f in sample.errors(*sensor):
+        u = f[0] / np.linalg.norm(f[0], axis=1, keepdims=True)
+        count, last = count + int(jumps(u, last).sum()), u[-1]
+    clusters = Clusters.of(int(sample.poses[0]), count)
+    for first, e, f in sample.errors(*sensor):
         u = f[0] / np.linalg.norm(f[0], axis=1, keepdims=True)
         w = np.ones(len(u)) if weights is None else weights[at, first : first + len(u)]
         clusters.add(np.ascontiguousarray(u), np.sqrt(w) * e[0], w)
@@ -288,7 +308,7 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
 
 
 def _geometry(
-    solution: Solution, view: Observability, information: Float, sight: tuple[Float, Float], held: Bool | None
+    solution: Solution, information: Float, sight: tuple[Float, Float], held: Bool | None
 ) -> Geometry:
     """Return what the distinct attitudes of the poses determine, seen with the sensors `sight`.
 

@@ -49,6 +49,7 @@ ALIGNED = np.repeat([False, True, False], 3)
 """The parameters that are not estimated when the axes are taken as perpendicular."""
 
 PoseVerdict = Literal["good", "weak", "undetermined"]
+"""What the poses alone say of a calibration: how an error of one reading comes out in the parameters."""
 
 
 def design(u: Float) -> Float:

@@ -23,7 +23,7 @@ SUSPECT = 3.0
 BENT = 0.01
 """A residual beyond this part of g bends the fit so far that no first-order formula holds."""
 
-OUTLIER_LEVEL = 0.01
+OUTLIER_LEVEL = 0.002
 """Chance of naming an outlier among all poses where there is none (Bonferroni over the poses)."""
 
 STEPS, SETTLED = 12, 1e-6
@@ -111,7 +111,9 @@ def pose_residuals(
     beyond = beyond_chance(np.abs(studentised), sample.poses[:, None], free)
     outlier = beyond & real & (np.abs(error) > NO_NOISE * g)
     if rejected is not None:
-        _tell_rejected(rejected, order.astype(np.intp), (f, error, cofactor, total, free), studentised, left_out)
+        _tell_rejected(
+            rejected, order.astype(np.intp), (f, error, cofactor, total, free), studentised, left_out
+        )
         outlier |= np.take_along_axis(rejected, number, axis=1)
     return PoseResiduals(
         number, real, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
@@ -260,5 +262,3 @@ def _moved(force: Float, step: Float, g: float) -> Float:
     for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
         E[:, i, j] = step[:, p] / g
     return np.asarray(force + force @ E.swapaxes(1, 2) - step[:, None, 6:])
-
-

@@ -19,7 +19,14 @@ from accelcal_cli.calibration.problem import Loetters, compress, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import SURELY_TREMBLES, PoseNoise, Tremor, directions, pose_noise, tremor
+from accelcal_cli.calibration.weights import (
+    SURELY_TREMBLES,
+    PoseNoise,
+    Tremor,
+    directions,
+    pose_noise,
+    tremor,
+)
 from accelcal_cli.optimization.minimize import Run, minimize, polish
 
 SAME_MINIMUM = 1e-6
@@ -179,7 +186,7 @@ def _inverse(variance: Float) -> Float:
 
 
 def _with_noise(stated: Stated) -> Stated:
-    """Return the problem with what the scatter within its poses tells: their noise, and trembling that is taken back."""
+    """Return the problem with what the scatter within its poses tells: their noise, and trembling, given back."""
     sample, g = stated.sample, stated.settings.g
     K, D = first_sensors(stated.cost)
     trembling = tremor(sample, K, D, g)
@@ -312,7 +319,9 @@ def share(
         stated: the problem; sample: its readings, at one temperature.
         sensors: K and D that fit them best by the present weights, from so many parameters.
     """
-    counted = ~stated.rejected[0] if stated.rejected is not None else np.ones(int(sample.poses[0]), dtype=bool)
+    counted = (
+        ~stated.rejected[0] if stated.rejected is not None else np.ones(int(sample.poses[0]), dtype=bool)
+    )
     freedom = int(counted.sum()) - parameters
     if freedom < 1 or stated.noise is None:
         return stated, 0.0

@@ -51,11 +51,13 @@ def with_slopes(solution: Solution) -> Solution:
 
 
 def _settled(solution: Solution, degrees: Float) -> tuple[Solution, Slopes | None]:
-    """Return the solution with the weights that go with slopes, and these: an error that poses share is what is left."""
+    """Return the solution with the weights that go with slopes, and these: a shared error is what they leave."""
     slopes = _fit(solution, degrees)
     if slopes is None or solution.stated.settings.weights != "auto" or solution.stated.noise is None:
         return solution, slopes
-    stated = solution.stated.with_weights(solution.stated.sample.normalised(1.0 / solution.stated.noise.variance))
+    stated = solution.stated.with_weights(
+        solution.stated.sample.normalised(1.0 / solution.stated.noise.variance)
+    )
     stated, before = replace(stated, own=None), -1.0
     for _ in range(SHARED_ROUNDS):
         solution = replace(solution, stated=stated)
@@ -94,7 +96,16 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
     units = np.repeat([1.0 / g, 1.0], 3) * np.concatenate([np.ones(3), np.diagonal(low.K)]) / half
     (scale, bias), (sigma_scale, sigma_bias) = np.split(p[9:] * units, 2), np.split(s * dop * units, 2)
     temperature = Temperature(
-        middle, float(degrees.min()), float(degrees.max()), scale, bias, sigma_scale, sigma_bias, dop
+        reference=middle,
+        low=float(degrees.min()),
+        high=float(degrees.max()),
+        scale=scale,
+        bias=bias,
+        sigma_scale=sigma_scale,
+        sigma_bias=sigma_bias,
+        interval_scale=np.full(3, np.nan),  # the fit knows their factor
+        interval_bias=np.full(3, np.nan),
+        dop=dop,
     )
     B, C = information[:9, 9:], information[9:, 9:]
     sensor = _moved(low, p, g)

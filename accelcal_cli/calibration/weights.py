@@ -21,7 +21,7 @@ FEWEST_ALIKE = 4
 """Poses with scatter from which on it can be told how alike they are; fewer are taken as alike."""
 
 SMALLEST_RATIO = 0.01
-"""Least ratio of a pose's variance to the pooled one that is believed: quantised readings can have no scatter at all."""
+"""Least ratio of a pose's variance to the pooled one that is believed: quantised readings may not scatter at all."""
 
 MOST_PRIOR = 1e6
 """Degrees of freedom of the pooled covariance in a pose from which on the poses are alike."""
@@ -82,7 +82,7 @@ def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None)
     weight = (prior[:, None] + own * ratio) / (prior[:, None] + own)
     count = np.where(real & np.isfinite(sample.count), sample.count, 1.0)
     scale = np.where(real, weight / count, 0.0)
-    known = (np.isfinite(sample.count) | ~real).all(axis=1) & (own.sum(axis=1) > 0)
+    known: Bool = np.asarray((np.isfinite(sample.count) | ~real).all(axis=1) & (own.sum(axis=1) > 0))
     if shakes is not None:
         known &= (entries_of(sample)[:, 0, 0, 1] > 0) | (shakes.certainty <= SURELY_TREMBLES)
     return PoseNoise(expected * scale, pooled[:, None] * scale[..., None, None], own, prior, known)
@@ -90,7 +90,8 @@ def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None)
 
 def _covariances(sample: Sample, K: Float) -> tuple[Float, Float, Bool]:
     """Return the covariance of one reading of each pose as force, its degrees of freedom, and which poses are real."""
-    assert sample.scatter is not None and sample.count is not None
+    assert sample.scatter is not None
+    assert sample.count is not None
     real = sample.real(0, sample.scatter.shape[1])
     told = real & np.isfinite(sample.scatter).all(axis=2) & np.isfinite(sample.count)
     scatter = np.where(told[..., None], sample.scatter, 0.0)
@@ -106,9 +107,9 @@ def _covariances(sample: Sample, K: Float) -> tuple[Float, Float, Bool]:
 
 def entries_of(sample: Sample) -> Float:
     """Return which entries of the covariances of the poses are known, 0 or 1, shape (R, 1, 3, 3)."""
-    known = np.zeros(len(sample), dtype=bool)
+    known: Bool = np.zeros(len(sample), dtype=bool)
     if sample.cross is not None:
-        known = ~np.isnan(sample.cross).all(axis=(1, 2))
+        known = np.asarray(~np.isnan(sample.cross).all(axis=(1, 2)))
     return np.where(known[:, None, None, None], np.ones((3, 3)), np.eye(3))
 
 
@@ -146,7 +147,7 @@ def _digamma(x: Float) -> Float:
 
 
 def _trigamma(x: Float) -> Float:
-    """Return psi'(x) for x > 0, same shape: raised to x >= 6, then the asymptotic series [abramowitz1964] eq. 6.4.12."""
+    """Return psi'(x) for x > 0, same shape: raised to x >= 6, then the series of [abramowitz1964] eq. 6.4.12."""
     total = np.zeros_like(x)
     for _ in range(6):
         total, x = np.where(x < 6, total + 1.0 / (x * x), total), np.where(x < 6, x + 1.0, x)
@@ -162,6 +163,23 @@ def _inverse_trigamma(value: Float) -> Float:
         slope = (_trigamma(x * 1.0001) - here) / (0.0001 * x)
         x = np.maximum(x + here * (1.0 - here / value) / slope, 1e-6)
     return np.asarray(x)
+
+
+def alike_weights(sample: Sample) -> Float:
+    """Return weights of the means of poses by the scatter of all axes together, mean 1, shape (R, J).
+
+    Each axis is measured by its own variance over all poses, so that a noisy axis does not decide.
+    """
+    assert sample.scatter is not None
+    assert sample.count is not None
+    told = np.asarray(np.isfinite(sample.scatter).all(axis=2))
+    own = np.where(told, np.maximum(np.nan_to_num(sample.count) - 1.0, 0.0), 0.0)
+    square = np.where(told[..., None], sample.scatter, 0.0) ** 2
+    pooled = np.einsum("rj,rja->ra", own, square) / np.maximum(own.sum(axis=1), 1.0)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(own > 0, np.nanmean(square / pooled[:, None], axis=2), 1.0)
+    prior = _prior(np.maximum(ratio, SMALLEST_RATIO), 3.0 * own)[:, None]
+    return sample.normalised(sample.count * (prior + 3.0 * own) / (prior + 3.0 * own * ratio))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +229,9 @@ def tremor(sample: Sample, K: Float, D: Float, g: float) -> Tremor | None:
     # Along the force a tilt adds to the variance in the second order, of a Gaussian tremor by excess^2 / g^2.
     second = np.where(own > 0, excess, 0.0) ** 2 / (g * g)
     excess = np.where(whole[:, None], excess + 1.5 * second, excess)
-    excess = np.where(own > 0, excess * own / (own + 1.0), 0.0)  # of these readings, not of all that might have been
+    excess = np.where(
+        own > 0, excess * own / (own + 1.0), 0.0
+    )  # of these readings, not of all that might have been
     angle = np.sqrt(np.maximum(tau, 0.0)) / g
     with np.errstate(divide="ignore", invalid="ignore"):
         doubt = np.where(whole | (square <= 0), 0.0, np.sqrt(2.0) * size / np.sqrt(square) / g)

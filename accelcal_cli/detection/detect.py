@@ -318,7 +318,7 @@ def screen(readings: Readings, g: float) -> tuple[ErrorModel, float, float, str]
             K, D = plain.cost.parameters(middle)
             return ErrorModel(K[0], D[0]), math.nan, math.nan, "undetermined"
     result = fit(search(state(sample, settings), closed=True))
-    view = result.observability[0]
+    view = result.geometry.observability[0]
     verdict = "undetermined" if result.at_wall.any() else view.verdict
     model = ErrorModel(result.lower[0], result.D[0])
     return model, float(result.rms[0]), float(result.s[0]) * float(view.worst), verdict
