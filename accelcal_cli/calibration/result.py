@@ -206,7 +206,6 @@ class Calibration:
     gauge: Gauge
     sigma: Sigma
     interval: Sigma
-    coverage_factor: float | None
     dop: Dop
     geometry: Dop
     verdict: Verdict
@@ -242,6 +241,7 @@ class Calibration:
     version: str
     schema: str = SCHEMA
     temperature: Temperature | None = None
+    coverage_factor: float | None = None
 
     @property
     def model(self) -> ErrorModel:

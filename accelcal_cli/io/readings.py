@@ -426,8 +426,8 @@ def log_warnings(rows: int, first: Float, span: float, source: str, *, timed: bo
     if rows < RAW_ROWS or not (timed or np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) < ALIKE * span):
         return ()
     text = (
-        f"Each row is taken for a pose at rest, and these {rows:,} rows look like a log with moves in it; of many "
-        "readings of one pose, label the poses in a column."
+        f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, its static poses "
+        "have to be found first; of many readings of one pose, label the poses in a column."
     )
     place = {"<stdin>": "-", "<array>": "LOG"}.get(source, shlex.quote(source))
     return (Notice("log", "warning", text, f"{COMMAND}calibrate {place} --raw"),)

@@ -108,7 +108,7 @@ def test_the_verdict_comes_first(kind):
     result = _result(kind)
     text = re.sub(r"\s+", " ", Reader(_page(kind)).text)
     assert text.index(f"Verdict: {result.verdict}") < text.index("Parameters")
-    for sentence in (*result.reasons, *result.cautions, *result.notes, result.before):
+    for sentence in (*result.reasons, *map(str, result.warnings), *result.notes, result.before):
         assert typeset(sentence) in text
 
 
@@ -125,7 +125,7 @@ def test_a_page_holds_every_part(good):
         "Sensor 7",
         good.data["sha256"],
         f"accelcal {accelcal_cli.__version__}",
-        "accelcal/calibration/1",
+        "accelcal/calibration/2",
         f"{good.K_a[0, 0]:.8g}",
         f"{good.sigma.D_a[2]:.2g}",
         "scale factor error x",
