@@ -13,13 +13,12 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.schema import from_mapping
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -104,10 +103,6 @@ class Registry(Generic[T]):
         if name not in self._classes and name in self._entry_points:
             self.register(name)(self._load(self._entry_points[name]))
         return self._classes.get(name)
-
-    def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
-        """Build the class called `name` from `mapping`; see `schema.from_mapping`."""
-        return from_mapping(self.get(name), mapping, where)
 
     def beside(self, name: str, suffix: str) -> Path | None:
         """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""

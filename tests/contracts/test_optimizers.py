@@ -12,6 +12,7 @@ import pytest
 from accelcal_cli.config import load_mapping
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, State, optimizer_file
+from accelcal_cli.schema import from_mapping
 
 NAMES = OPTIMIZERS.names()
 PAIRS = [(name, case) for name in NAMES for case in contract.cases(OPTIMIZERS.get(name))]
@@ -126,7 +127,7 @@ def test_every_optimizer_ships_its_settings(name):
     assert record["optimizer"] == name
     assert record["source"]
     assert set(record["parameters"]) == {field.name for field in dataclasses.fields(cls)}
-    built = OPTIMIZERS.build(name, record["parameters"], name)
+    built = from_mapping(OPTIMIZERS.get(name), record["parameters"], name)
     for key, stated in record["parameters"].items():
         value = getattr(built, key)
         assert (list(value) if isinstance(value, tuple) else value) == stated
