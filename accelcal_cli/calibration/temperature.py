@@ -16,6 +16,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK
 from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
+from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import SLOPES, Slopes, Solution
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
@@ -37,19 +38,24 @@ def with_slopes(solution: Solution) -> Solution:
         return solution
     degrees = sample.temperature[0]
     why = _unsuitable(solution, degrees)
-    slopes = None if why else _fit(solution, degrees)
-    if slopes is None:
+    fitted = None if why else _fit(solution, degrees)
+    if fitted is None:
         why = why or "the poses do not determine slopes with temperature"
         return replace(solution, notes=(*solution.notes, f"Temperature column not used: {why}."))
-    triangle = packed(slopes.sample, solution.stated.weights, within=sample)
+    slopes, brought = fitted
+    triangle = packed(brought, solution.stated.weights, within=sample)
     cost = Loetters(triangle, settings.g, solution.cost.box)
     middle = slopes.temperature.reference
     note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
-    return replace(solution.solved_anew(cost), plain=cost, slopes=slopes, notes=(*solution.notes, note))
+    notes = (*solution.notes, note)
+    return replace(solution.solved_anew(cost), sample=brought, plain=cost, slopes=slopes, notes=notes)
 
 
-def _fit(solution: Solution, degrees: Float) -> Slopes | None:
-    """Return the slopes of poses of these temperatures, shape (J,), or None where they do not determine them."""
+def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
+    """Return the slopes, and the readings brought to the reference temperature; None where nothing determines them.
+
+    `degrees`: temperatures of the poses, shape (J,).
+    """
     sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.stated.weights
     K, D = solution.cost.parameters(solution.x)
     low = ErrorModel(to_gauge(K[0], "lower"), D[0])
@@ -77,7 +83,8 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
     )
     B, C = information[:9, 9:], information[9:, 9:]
     brought = temperature.at_reference(N, degrees, _moved(low, p, g).D)
-    return Slopes(temperature, sample.with_output(brought[None]), (B @ np.linalg.solve(C, B.T))[None])
+    slopes = Slopes(temperature, (B @ np.linalg.solve(C, B.T))[None])
+    return slopes, sample.with_output(brought[None])
 
 
 def _unsuitable(solution: Solution, degrees: Float) -> str:
