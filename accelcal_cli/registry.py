@@ -13,8 +13,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import sys
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
@@ -113,6 +114,8 @@ class Registry(Generic[T]):
     @cached_property
     def _entry_points(self) -> dict[str, EntryPoint]:
         """The entry points of the group; where two packages share a name, the first on the path has it."""
+        if not is_mentioned(self.group):
+            return {}
         from importlib.metadata import entry_points
 
         return {point.name: point for point in reversed(tuple(entry_points(group=self.group)))}
@@ -131,3 +134,15 @@ class Registry(Generic[T]):
         if not (inspect.isclass(cls) and issubclass(cls, self.base)) or inspect.isabstract(cls):
             raise ConfigError(f"{place}: {point.value} is not a complete subclass of {self.base.__name__}")
         return cast(type[T], cls)
+
+
+@cache
+def is_mentioned(group: str) -> bool:
+    """Return whether an installed package may have entry points of a group: `importlib.metadata` is slow to import."""
+    for folder in map(Path, sys.path):
+        if folder.is_file():  # an archive: what is in it, `importlib.metadata` finds out
+            return True
+        files = folder.glob("*-info/entry_points.txt")
+        if any(f"[{group}]" in file.read_text("utf-8", errors="replace") for file in files):
+            return True
+    return False
