@@ -105,6 +105,10 @@ class Registry(Generic[T]):
             self.register(name)(self._load(self._entry_points[name]))
         return self._classes.get(name)
 
+    def is_built_in(self, cls: type) -> bool:
+        """Return whether a class is one of ours, and not of an installed package."""
+        return cls.__module__.startswith(f"{self.package}.")
+
     def beside(self, name: str, suffix: str) -> Path | None:
         """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""
         cls = self.find(name)
