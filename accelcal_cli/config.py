@@ -1,5 +1,7 @@
 """YAML text to mappings and back, and the files that are shipped: the only place that reads or writes YAML.
 
+The parser is imported when there is YAML to read: most runs are without, and it takes as long as half of numpy.
+
 What a mapping means, a calibration or a sensor, is known where that is defined.
 """
 
@@ -8,10 +10,9 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
-
-import yaml
 
 from accelcal_cli.errors import ConfigError
 
@@ -22,19 +23,25 @@ if not CONFIGS.is_dir():  # a checkout keeps them beside the package
     CONFIGS = Path(__file__).parent.parent / "configs"
 
 
-class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A safe loader that refuses a key given twice: YAML itself would silently keep the last."""
+@cache
+def _loader() -> Any:
+    """Return a safe loader that refuses a key given twice: YAML itself would silently keep the last."""
+    import yaml
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str) or key in seen:
-                fault = f'key "{key}" is given twice' if isinstance(key, str) else f"key {key!r} is not text"
-                raise yaml.constructor.ConstructorError(None, None, fault, key_node.start_mark)
-            seen.add(key)
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        return mapping
+    class UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+            seen = set()
+            for key_node, _ in node.value:
+                key = self.construct_object(key_node, deep=True)
+                if not isinstance(key, str) or key in seen:
+                    twice = f'key "{key}" is given twice'
+                    fault = twice if isinstance(key, str) else f"key {key!r} is not text"
+                    raise yaml.constructor.ConstructorError(None, None, fault, key_node.start_mark)
+                seen.add(key)
+            mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+            return mapping
+
+    return UniqueKeys
 
 
 def load_mapping(path: Path) -> dict[str, Any]:
@@ -71,8 +78,10 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
         with contextlib.suppress(ValueError):  # YAML in flow style, or a fault that the YAML parser can place
             mapping: dict[str, Any] = json.loads(text, object_pairs_hook=_unique)
             return mapping
+    import yaml
+
     try:
-        content = yaml.load(text, Loader=_UniqueKeys)
+        content = yaml.load(text, Loader=_loader())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -94,6 +103,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def dump(record: Mapping[str, Any]) -> str:
     """Return a record as YAML text that reads back to the same record."""
+    import yaml
+
     text: str = yaml.dump(
         record,
         Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),

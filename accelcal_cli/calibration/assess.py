@@ -216,7 +216,7 @@ def edge_names(at_wall: Bool) -> tuple[str, ...]:
 
 def _to_gain(fit: Fit) -> Float:
     """Return the part of the cost that a Gauss-Newton step would take off, shape (R,); 0 after a polish."""
-    gain = np.zeros(len(fit.sample))
+    gain = np.zeros(len(fit.K))
     solution = fit.solution
     if solution is None or fit.settings.polish:
         return gain

@@ -15,7 +15,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
-from accelcal_cli.calibration.sample import NEEDS, Sample
+from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import DataError
@@ -55,7 +55,7 @@ def calibrate_many(readings: Sequence[Readings], settings: Settings) -> list[Cal
     results: list[Calibration | None] = [None] * len(readings)
     for group in _groups(readings, settings):
         sample = Sample.of([readings[at] for at in group])
-        for at, fault in zip(group, faults(sample, settings), strict=True):
+        for at, fault in zip(group, sample.faults(settings.weights), strict=True):
             if fault:
                 raise DataError(f"{readings[at].source}: {fault}")
         assessment = assessed(sample, settings)
@@ -93,19 +93,6 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
             solution = with_slopes(solution)
         result = fit(solution)
     return assess(result)
-
-
-def faults(sample: Sample, settings: Settings) -> list[str]:
-    """Return why each sensor cannot be calibrated, in a sentence, or nothing."""
-    words = [""] * len(sample)
-    for at in np.flatnonzero(sample.without_weights(settings.weights)).tolist():
-        words[at] = f"--weights {settings.weights} needs {NEEDS[settings.weights]}"
-    for at in np.flatnonzero(~(sample.upper > sample.lower).any(axis=1)).tolist():
-        poses = int(sample.poses[at])
-        words[at] = (
-            f"nothing to calibrate: {'only one pose' if poses == 1 else f'all {poses} poses are equal'}"
-        )
-    return words
 
 
 def record(assessment: Assessment, at: int) -> Calibration:

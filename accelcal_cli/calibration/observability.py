@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -153,7 +154,7 @@ class Observability:
         """Definition: undetermined above 25 or below full rank, weak above 10, good otherwise. One set of poses."""
         return verdict_of(float(self.worst), int(self.rank), len(self.names))
 
-    @property
+    @cached_property
     def verdicts(self) -> list[PoseVerdict]:
         """The verdict on each of R sets of poses."""
         return [

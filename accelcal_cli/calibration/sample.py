@@ -10,7 +10,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
-from accelcal_cli.io.readings import LOOKED_AT, RAW_ROWS, Readings, may_be_doubtful
+from accelcal_cli.io.readings import Readings
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -101,13 +101,12 @@ class Sample:
     @classmethod
     def of_batch(cls, fleet: FleetReadings, batch: Batch) -> Sample:
         """Return the sample of a batch of a fleet."""
-        doubtful = may_be_doubtful(batch.output[:, :LOOKED_AT], batch.count) | (batch.count >= RAW_ROWS)
         return cls(
             poses=batch.count,
             lower=batch.output.min(axis=1),
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
-            doubtful=doubtful,
+            doubtful=batch.doubtful,
             labelled=fleet.labelled(batch),
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
@@ -179,6 +178,18 @@ class Sample:
             usable &= ~np.isnan(scatter).any(axis=2)
             usable &= (choice == "auto") | (scatter > 0).any(axis=2)
         return np.asarray((~usable & self.real(0, count.shape[1])).any(axis=1))
+
+    def faults(self, choice: Weights) -> list[str]:
+        """Return why each sensor cannot be calibrated with these weights, in a sentence, or nothing."""
+        words = [""] * len(self)
+        for at in np.flatnonzero(self.without_weights(choice)).tolist():
+            words[at] = f"--weights {choice} needs {NEEDS[choice]}"
+        for at in np.flatnonzero(~(self.upper > self.lower).any(axis=1)).tolist():
+            poses = int(self.poses[at])
+            words[at] = (
+                f"nothing to calibrate: {'only one pose' if poses == 1 else f'all {poses} poses are equal'}"
+            )
+        return words
 
     def errors(self, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
         """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).

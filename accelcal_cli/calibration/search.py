@@ -111,7 +111,6 @@ class Slopes:
 
     Attributes:
         temperature: the slopes.
-        sample: the readings at the reference temperature.
         loss: information that the slopes take from the nine, shape (R, 9, 9).
         sensor: K, gauge `lower`, and D at the reference temperature, shapes (R, 3, 3) and (R, 3).
         rows: the design of the nine parameters without what the slopes take, and of the slopes, shape (R, J, 15).
@@ -119,7 +118,6 @@ class Slopes:
     """
 
     temperature: Temperature
-    sample: Sample
     loss: Float
     sensor: tuple[Float, Float]
     rows: Float
@@ -132,6 +130,7 @@ class Solution:
 
     Attributes:
         stated: the problem; search: how it was searched.
+        sample: the readings that were fitted: with slopes, those at the reference temperature.
         cost: the Loetters cost as last solved, with the weights of a robust loss; plain: without them.
         x: the best point of each sensor, shape (R, D); value: L there, shape (R,), (m/s^2)^4.
         noise: robust standard deviation of e, m/s^2, shape (R,); None without a robust loss.
@@ -141,6 +140,7 @@ class Solution:
 
     stated: Stated
     search: Search
+    sample: Sample
     cost: Loetters
     plain: Loetters
     x: Float
@@ -148,11 +148,6 @@ class Solution:
     noise: Float | None = None
     slopes: Slopes | None = None
     notes: tuple[str, ...] = ()
-
-    @property
-    def sample(self) -> Sample:
-        """The readings that were fitted: with slopes, those at the reference temperature."""
-        return self.stated.sample if self.slopes is None else self.slopes.sample
 
     def solved_anew(self, cost: Loetters) -> Solution:
         """Return the solution carried over to a cost that differs a little: polished from where it was."""
@@ -237,7 +232,7 @@ def search(stated: Stated, *, closed: bool = False) -> Solution:
     row = np.arange(sensors) * runs + best
     spent = evaluations.reshape(sensors, runs).sum(axis=1)
     found = Search(settings.optimizer, runs, run.cost[row], spent, agreeing, run, row)
-    return Solution(stated, found, cost, cost, x[row], least)
+    return Solution(stated, found, stated.sample, cost, cost, x[row], least)
 
 
 def _searched(cost: Loetters, settings: Settings, sensors: int) -> Run:

@@ -16,6 +16,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK, moved_sensor
 from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
+from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import SHARED_ROUNDS, SHARED_SETTLED, SLOPES, Slopes, Solution, share
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
@@ -37,42 +38,46 @@ def with_slopes(solution: Solution) -> Solution:
         return solution
     degrees = sample.temperature[0]
     why = _unsuitable(solution, degrees)
-    slopes = None
+    fitted = None
     if not why:
-        solution, slopes = _settled(solution, degrees)
-    if slopes is None:
+        solution, fitted = _settled(solution, degrees)
+    if fitted is None:
         why = why or "the poses do not determine slopes with temperature"
         return replace(solution, notes=(*solution.notes, f"Temperature column not used: {why}."))
-    triangle = packed(slopes.sample, solution.stated.weights, within=sample)
+    slopes, brought = fitted
+    triangle = packed(brought, solution.stated.weights, within=sample)
     cost = Loetters(triangle, settings.g, solution.cost.box)
     middle = slopes.temperature.reference
     note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
-    return replace(solution.solved_anew(cost), plain=cost, slopes=slopes, notes=(*solution.notes, note))
+    notes = (*solution.notes, note)
+    return replace(solution.solved_anew(cost), sample=brought, plain=cost, slopes=slopes, notes=notes)
 
 
-def _settled(solution: Solution, degrees: Float) -> tuple[Solution, Slopes | None]:
-    """Return the solution with the weights that go with slopes, and these: a shared error is what they leave."""
-    slopes = _fit(solution, degrees)
-    if slopes is None or solution.stated.settings.weights != "auto" or solution.stated.noise is None:
-        return solution, slopes
-    stated = solution.stated.with_weights(
-        solution.stated.sample.normalised(1.0 / solution.stated.noise.variance)
-    )
-    stated, before = replace(stated, own=None), -1.0
+def _settled(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes, Sample] | None]:
+    """Return the solution with the weights that go with slopes, and these as `_fit` does: they leave a shared error."""
+    fitted, stated = _fit(solution, degrees), solution.stated
+    if fitted is None or stated.settings.weights != "auto" or stated.noise is None:
+        return solution, fitted
+    weights = stated.sample.normalised(1.0 / stated.noise.variance)
+    stated, before = replace(stated.with_weights(weights), own=None), -1.0
     for _ in range(SHARED_ROUNDS):
         solution = replace(solution, stated=stated)
-        slopes = _fit(solution, degrees)
-        if slopes is None:
+        fitted = _fit(solution, degrees)
+        if fitted is None:
             return solution, None
-        stated, shared = share(stated, slopes.sample, slopes.sensor, 9 + SLOPES)
+        stated, shared = share(stated, fitted[1], fitted[0].sensor, 9 + SLOPES)
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
         before = shared
-    return replace(solution, stated=stated), _fit(replace(solution, stated=stated), degrees)
+    solution = replace(solution, stated=stated)
+    return solution, _fit(solution, degrees)
 
 
-def _fit(solution: Solution, degrees: Float) -> Slopes | None:
-    """Return the slopes of poses of these temperatures, shape (J,), or None where they do not determine them."""
+def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
+    """Return the slopes, and the readings brought to the reference temperature; None where nothing determines them.
+
+    `degrees`: temperatures of the poses, shape (J,).
+    """
     sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.stated.weights
     K, D = solution.cost.parameters(solution.x)
     low = ErrorModel(to_gauge(K[0], "lower"), D[0])
@@ -113,14 +118,9 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
     part = np.linalg.solve(C, B.T)
     # What the slopes' columns take from those of the nine parameters does not determine these.
     rows = np.column_stack([J[:, :9] - J[:, 9:] @ part, J[:, 9:]])
-    return Slopes(
-        temperature,
-        sample.with_output(brought[None]),
-        (B @ part)[None],
-        (sensor.K[None], sensor.D[None]),
-        rows[None],
-        np.linalg.inv(C)[None],
-    )
+    found = sensor.K[None], sensor.D[None]
+    slopes = Slopes(temperature, (B @ part)[None], found, rows[None], np.linalg.inv(C)[None])
+    return slopes, sample.with_output(brought[None])
 
 
 def _unsuitable(solution: Solution, degrees: Float) -> str:

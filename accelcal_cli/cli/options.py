@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from accelcal_cli.errors import UsageError, did_you_mean
+from accelcal_cli.registry import is_mentioned
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
@@ -59,17 +60,11 @@ def classes_in(package: str, group: str) -> list[str]:
     """
     modules = (module.name for module in pkgutil.iter_modules(import_module(package).__path__))
     names = {name.replace("_", "-") for name in modules if name != "base"}
-    if _is_mentioned(group):
+    if is_mentioned(group):
         from importlib.metadata import entry_points
 
         names.update(point.name for point in entry_points(group=group))
     return sorted(names)
-
-
-def _is_mentioned(group: str) -> bool:
-    """Return whether an installed package may have entry points of a group: `importlib.metadata` is slow to import."""
-    files = (file for folder in sys.path for file in Path(folder).glob("*-info/entry_points.txt"))
-    return any(f"[{group}]" in file.read_text("utf-8", errors="replace") for file in files)
 
 
 optimizers = partial(classes_in, "accelcal_cli.optimization.algorithms", "accelcal.optimizers")

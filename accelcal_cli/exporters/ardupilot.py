@@ -7,15 +7,15 @@ same sign: AccelCalibrator fits diag * (reading + offset) and saves minus its of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
 from accelcal_cli.schema import setting
-from accelcal_cli.sensor.poses import AXES
+
+if TYPE_CHECKING:
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.calibration.result import Calibration
 
 LARGEST_OFFSET, SCALES = 3.5, (0.8, 1.2)
 """What ArduPilot's parameters may be, m/s^2 and 1: beyond, it refuses to arm."""
@@ -35,6 +35,8 @@ class ArduPilot(DiagonalExporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
+        from accelcal_cli.sensor.poses import AXES
+
         offset, scale = self._parameters(result)
         header = [
             *base.origin(result),
@@ -52,9 +54,7 @@ class ArduPilot(DiagonalExporter):
     def warnings(self, result: Calibration) -> tuple[str, ...]:
         """Return what is left out, and whether ArduPilot would refuse the parameters."""
         offset, scale = self._parameters(result)
-        usual = (
-            np.abs(offset).max() <= LARGEST_OFFSET and SCALES[0] <= scale.min() <= scale.max() <= SCALES[1]
-        )
+        usual = abs(offset).max() <= LARGEST_OFFSET and SCALES[0] <= scale.min() <= scale.max() <= SCALES[1]
         refused = (
             f"ArduPilot expects offsets up to {LARGEST_OFFSET:g} m/s^2 and "
             f"scales of {SCALES[0]:g} to {SCALES[1]:g}"
@@ -64,4 +64,4 @@ class ArduPilot(DiagonalExporter):
     def _parameters(self, result: Calibration) -> tuple[Float, Float]:
         """Return offset, m/s^2, and scale, shape (3,) each."""
         model = self.in_metres(result)
-        return model.D, 1.0 / np.diagonal(model.K)
+        return model.D, 1.0 / model.K.diagonal()

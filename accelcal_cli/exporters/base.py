@@ -1,7 +1,8 @@
 """What every exporter is, and what all formats share: the origin of the numbers, their units, and what a format drops.
 
 A format is one file: a frozen dataclass derived from `Exporter` and entered in `EXPORTERS`. Help, completion, the
-documentation and the contract tests follow from the class.
+documentation and the contract tests follow from the class. The help imports every format: numpy and what needs it are
+imported where a file is made.
 """
 
 from __future__ import annotations
@@ -9,17 +10,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
 from accelcal_cli.schema import Checked, setting
-from accelcal_cli.sensor.model import MRAD, STANDARD_GRAVITY, ErrorModel
-from accelcal_cli.sensor.poses import AXES
+
+if TYPE_CHECKING:
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.sensor.model import ErrorModel
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -97,8 +97,10 @@ class DriverExporter(Exporter):
             UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver
                 scale that is not that of these readings.
         """
+        from accelcal_cli.sensor.model import ErrorModel
+
         metres = metres_per_unit(result)
-        scale = np.diagonal(result.K_a) / metres
+        scale = result.K_a.diagonal() / metres
         if self.driver_scale is not None:
             near = scale / self.driver_scale
             if not (NEAR_ONE[0] < near.min() and near.max() < NEAR_ONE[1]):
@@ -121,10 +123,15 @@ class DiagonalExporter(DriverExporter):
 
     def warnings(self, result: Calibration) -> tuple[str, ...]:
         """Return the misalignments that are left out, in mrad and as force at 1 g, and what all formats leave out."""
+        import numpy as np
+
+        from accelcal_cli.sensor.model import MRAD
+        from accelcal_cli.sensor.poses import AXES
+
         further = super().warnings(result)
         if result.held.any():
             return further
-        rest = result.K_a / np.diagonal(result.K_a)[:, None] - np.eye(3)
+        rest = result.K_a / result.K_a.diagonal()[:, None] - np.eye(3)
         i, j = np.unravel_index(int(np.abs(rest).argmax()), (3, 3))
         angle = abs(float(rest[i, j]))
         error = result.g * metres_per_unit(result) * float(np.linalg.norm(rest, 2))
@@ -152,16 +159,18 @@ def comment(lines: Iterable[str], mark: str = "#") -> str:
 
 
 def rows(matrix: Float) -> list[list[float]]:
-    """Return a matrix as lists of plain numbers."""
-    return [[float(v) for v in row] for row in np.atleast_2d(matrix)]
+    """Return a matrix, or a vector as one row, as lists of plain numbers."""
+    return [[float(v) for v in row] for row in matrix.reshape(-1, matrix.shape[-1])]
 
 
 def is_force(result: Calibration) -> bool:
     """Return whether the readings are specific force already, in the unit of the result."""
-    scale = np.diagonal(result.K_a)
+    scale = result.K_a.diagonal()
     return bool(NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1])
 
 
 def metres_per_unit(result: Calibration) -> float:
     """Return how many m/s^2 one unit of the calibrated force is: 9.80665 for g, else 1."""
+    from accelcal_cli.sensor.model import STANDARD_GRAVITY
+
     return STANDARD_GRAVITY if result.unit == "g" else 1.0

@@ -5,14 +5,14 @@ Its K_a holds the scale factors alone, R_a the rest. The gyroscope is left as it
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 FORMAT = "2.0.0"
 
@@ -30,7 +30,11 @@ class Imucal(Exporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the record as JSON."""
-        scale = np.linalg.norm(result.K_a, axis=1) if result.gauge == "full" else np.diagonal(result.K_a)
+        import json
+
+        import numpy as np
+
+        scale = np.linalg.norm(result.K_a, axis=1) if result.gauge == "full" else result.K_a.diagonal()
         record = {
             "cal_type": "Ferraris",
             "_format_version": FORMAT,

@@ -7,10 +7,13 @@ estimates b anew in every run; the key is for other readers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, DriverExporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 UNKNOWN = """\
   # PLACEHOLDERS: a static calibration does not know them. Take them from the data sheet or an Allan deviation.

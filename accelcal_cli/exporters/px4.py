@@ -6,14 +6,14 @@ It does so axis by axis, and turns the board afterwards (PX4-Autopilot, src/lib/
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
 from accelcal_cli.schema import setting
-from accelcal_cli.sensor.poses import AXES
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 REAL32 = 9  # MAV_PARAM_TYPE_REAL32
 
@@ -32,6 +32,8 @@ class Px4(DiagonalExporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
+        from accelcal_cli.sensor.poses import AXES
+
         model = self.in_metres(result)
         name = f"CAL_ACC{self.instance}"
         header = [
@@ -43,7 +45,7 @@ class Px4(DiagonalExporter):
         ]
         lines = "".join(
             f"1\t1\t{name}_{axis.upper()}{key}\t{value:.9g}\t{REAL32}\n"
-            for key, values in (("OFF", model.D), ("SCALE", 1.0 / np.diagonal(model.K)))
+            for key, values in (("OFF", model.D), ("SCALE", 1.0 / model.K.diagonal()))
             for axis, value in zip(AXES, values, strict=True)
         )
         return (base.comment(header) + lines).encode()

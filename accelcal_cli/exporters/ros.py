@@ -6,10 +6,13 @@ SM is K_A, row by row, and bias is f_0, in m/s^2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 
 @EXPORTERS.register("ros")

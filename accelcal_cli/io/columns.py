@@ -12,9 +12,11 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from accelcal_cli.arrays import Float
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
-from accelcal_cli.io.reader import InputTable, Selection
+from accelcal_cli.io.reader import InputTable, RowBlock, Selection
 
 Triple = tuple[int, int, int]
 Group = dict[str, tuple[list[int], list[int], list[int]]]
@@ -116,6 +118,23 @@ class Columns:
         at = 0 if self.count is None else 1
         then = at + (0 if self.scatter is None else 3)
         return extras[:, 0] if at else None, extras[:, at:then] if then > at else None, extras[:, then:]
+
+    def check(self, table: InputTable, rows: RowBlock) -> None:
+        """Refuse counts that are not whole numbers of 1 or more, and standard deviations below zero."""
+        for at, column in enumerate(self.extras, 3):
+            counts, values = column == self.count, rows.numbers[:, at]
+            bad = are_no_counts(values) if counts else values < 0
+            if (counts or column in (self.scatter or ())) and bad.any():
+                expected = "count of 1 or more" if counts else "standard deviation of 0 or more"
+                where = table.where(rows.start + int(np.argmax(bad)))
+                raise DataError(
+                    f'{table.name}, {where}, column "{(table.names or ())[column]}": a {expected} was expected'
+                )
+
+
+def are_no_counts(count: Float) -> Bool:
+    """Return which numbers are not whole ones of 1 or more, same shape."""
+    return np.asarray((count < 1) | (count != np.round(count)))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,11 +20,12 @@ from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_c
 from accelcal_cli.io.reader import InputTable, RowBlock, open_table
 from accelcal_cli.io.readings import (
     LOOKED_AT,
+    RAW_ROWS,
     LabelledMeans,
     Readings,
-    check_rows,
     doubts,
     log_warnings,
+    may_be_doubtful,
     number_labels,
 )
 from accelcal_cli.io.stream import RowStore
@@ -79,6 +80,7 @@ class Batch:
     Attributes:
         sensors: their numbers, shape (R,); count: poses of each, shape (R,).
         output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
+        doubtful: which sensors have cautions, or might have, shape (R,).
         behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
         scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise; cross: covariances xy, xz
             and yz of one, shape (R, J, 3), sensor units squared, likewise.
@@ -88,19 +90,10 @@ class Batch:
     count: Int
     output: Float
     pose: Int
+    doubtful: Bool
     behind: Float | None = None
     scatter: Float | None = None
     cross: Float | None = None
-
-    @property
-    def real(self) -> Bool:
-        """Which poses are no repetitions, shape (R, J)."""
-        return np.asarray(np.arange(self.output.shape[1]) < self.count[:, None])
-
-    def take(self, index: Int) -> Batch:
-        """Return the sensors at `index`."""
-        arrays = {part.name: getattr(self, part.name) for part in fields(self)}
-        return replace(self, **{name: array[index] for name, array in arrays.items() if array is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +174,13 @@ class FleetReadings:
             index = by_count[group]
             steps = np.minimum(np.arange(int(counts[index].max())), counts[index, None] - 1)
             at = order[starts[index, None] + steps]
+            count, output = counts[index], rows[at, 1:]
             yield Batch(
                 first + index,
-                counts[index],
-                rows[at, 1:],
+                count,
+                output,
                 pose[at],
+                may_be_doubtful(output[:, :LOOKED_AT], count) | (count >= RAW_ROWS),
                 *(None if extras is None else extras[at][..., part] for part in EXTRAS),
             )
 
@@ -301,7 +296,7 @@ class _FleetCollector:
         for rows in table.blocks(columns.selection()):
             if not len(rows.numbers):
                 continue
-            check_rows(table, columns, rows)
+            columns.check(table, rows)
             labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
             codes = number_labels(self.index, labels)
             output, (count, scatter, _) = rows.numbers[:, :3], columns.split(rows.numbers[:, 3:])

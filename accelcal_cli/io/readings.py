@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import LIMIT, InputTable, RowBlock, open_table
+from accelcal_cli.io.columns import Columns, are_no_counts, choose
+from accelcal_cli.io.reader import LIMIT, RowBlock, open_table
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 from accelcal_cli.notices import COMMAND, Notice
 
@@ -121,7 +121,7 @@ class Readings:
         if labels is not None and not len(set(map(str, labels))) == len(labels) == poses:
             raise DataError(f"labels: {poses} different labels were expected, one per pose")
         numbers = None if count is None else _array("count", count, 1, poses)[:, 0]
-        if numbers is not None and _are_no_counts(numbers).any():
+        if numbers is not None and are_no_counts(numbers).any():
             raise DataError("count: whole numbers of 1 or more were expected")
         collector = Collector(source, Columns((0, 1, 2), ("1", "2", "3")))
         collector.add(RowBlock(0, rows))
@@ -177,24 +177,11 @@ def read_readings(
     try:
         collector = Collector(table.name, choose(table, columns))
         for rows in table.blocks(collector.columns.selection()):
-            check_rows(table, collector.columns, rows)
+            collector.columns.check(table, rows)
             collector.add(rows)
         return collector.readings(table.sha256, table.where)
     finally:
         table.close()
-
-
-def check_rows(table: InputTable, columns: Columns, rows: RowBlock) -> None:
-    """Refuse counts that are not whole numbers of 1 or more, and standard deviations below zero."""
-    for at, column in enumerate(columns.extras, 3):
-        counts, values = column == columns.count, rows.numbers[:, at]
-        bad = _are_no_counts(values) if counts else values < 0
-        if (counts or column in (columns.scatter or ())) and bad.any():
-            expected = "count of 1 or more" if counts else "standard deviation of 0 or more"
-            where = table.where(rows.start + int(np.argmax(bad)))
-            raise DataError(
-                f'{table.name}, {where}, column "{(table.names or ())[column]}": a {expected} was expected'
-            )
 
 
 class Collector:
@@ -480,10 +467,6 @@ def may_be_doubtful(output: Float, poses: Int) -> Bool:
 
 def _sums(codes: Int, values: Float, size: int) -> Float:
     return np.bincount(codes, weights=values, minlength=size).astype(np.float64, copy=False)
-
-
-def _are_no_counts(count: Float) -> Bool:
-    return np.asarray((count < 1) | (count != np.round(count)))
 
 
 def _array(what: str, values: ArrayLike, width: int, rows: int | None = None, *, gaps: bool = False) -> Float:

@@ -307,7 +307,7 @@ def odd(tmp_path_factory):
 def test_sensors_that_stand_out_are_named_and_no_others(odd):
     labels, fleet = odd
     found = standouts(fleet, G)
-    assert {(labels[one.at], one.quantity.name) for one in found} == {
+    assert {(labels[one.at], one.name) for one in found} == {
         ("S07", "scale factor y"),
         ("S20", "bias z"),
         ("S33", "noise of a pose, s"),

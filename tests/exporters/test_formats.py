@@ -19,6 +19,7 @@ from accelcal_cli.errors import ConfigError, UsageError
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import read_readings
 from accelcal_cli.notices import Notice
+from accelcal_cli.schema import from_mapping
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
@@ -48,7 +49,7 @@ def counts():
 
 
 def export(found, name, **options):
-    return EXPORTERS.build(name, options, name).export(found)
+    return from_mapping(EXPORTERS.get(name), options, name).export(found)
 
 
 def text(made):
