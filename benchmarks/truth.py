@@ -28,6 +28,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
+import numpy as np
+
 from benchmarks.truth_scenes import (
     Outcome,
     Recording,
@@ -63,7 +65,7 @@ class Drawn:
 
     Attributes:
         shift: of the fault, in honest sigma; matters, right, named: as at the top; verdict, keys: of the faulty one.
-        honest: verdict of the honest counterpart, empty without one; honest_keys: what was said of it.
+        honest: verdict of the honest counterpart; honest_keys: what was said of it.
         sound: whether it counts as good.
         inside, honest_inside: how many 95 % intervals hold of those called good or weak, and how many there are.
     """
@@ -99,27 +101,23 @@ class Cell:
         of = self.mattering
         if not of:
             return None
-        hits = [one.right and one.named if what == "both" else getattr(one, what) for one in of]
+        hits = [(one.right or what == "named") and (one.named or what == "right") for one in of]
         return sum(hits) / len(of)
 
     @property
-    def honest(self) -> list[Drawn]:
-        return [one for one in self.drawn if one.honest]
-
-    @property
     def unsound(self) -> int:
-        return sum(not one.sound for one in self.honest)
+        return sum(not one.sound for one in self.drawn)
 
     @property
     def passed(self) -> bool:
         both = self.share("both")
-        return (both is None or both >= RIGHT) and self.unsound <= HONEST_CELL * max(1, len(self.honest))
+        return (both is None or both >= RIGHT) and self.unsound <= HONEST_CELL * len(self.drawn)
 
     def row(self) -> list[str]:
         """Return the cells of the table."""
         shares = [_percent(self.share(what)) for what in ("right", "named")]
         matters = _percent(len(self.mattering) / len(self.drawn))
-        honest = _percent(self.unsound / len(self.honest)) if self.honest else "-"
+        honest = _percent(self.unsound / len(self.drawn))
         return [
             self.trap,
             f"{self.noise:g} mg",
@@ -141,16 +139,15 @@ class Cell:
             "right": sum(one.right for one in self.mattering),
             "named": sum(one.named for one in self.mattering),
             "right_and_named": sum(one.right and one.named for one in self.mattering),
-            "honest": len(self.honest),
             "honest_not_good": self.unsound,
             "verdicts": Counter(one.verdict for one in self.mattering),
             "keys": Counter(key for one in self.mattering for key in one.keys),
-            "honest_verdicts": Counter(one.honest for one in self.honest),
-            "honest_keys": Counter(key for one in self.honest for key in one.honest_keys),
+            "honest_verdicts": Counter(one.honest for one in self.drawn),
+            "honest_keys": Counter(key for one in self.drawn for key in one.honest_keys),
             "missed": [
                 k for k, one in enumerate(self.drawn) if one.matters and not (one.right and one.named)
             ],
-            "false_alarms": [k for k, one in enumerate(self.drawn) if one.honest and not one.sound],
+            "false_alarms": [k for k, one in enumerate(self.drawn) if not one.sound],
         }
 
 
@@ -175,13 +172,13 @@ def draw(trap: Trap, noise: float, count: int, index: int, seed: int) -> Drawn:
     faulty, honest = trap.make(scene)
     outcome = observe(faulty)
     shift, matters = float("inf"), True
-    if trap.matters == "shift" and honest is not None:
+    if trap.matters == "shift":
         fault = fault_of(faulty, honest)
         shift, matters = fault.shift, fault.shift >= SHIFT and (fault.seen or trap.shown)
     right = not outcome.trusted
     if outcome.result is not None and outcome.trusted:
         right = holds(outcome.result, faulty.truth)
-    other = observe(honest) if honest is not None else None
+    other = observe(honest)
     return Drawn(
         shift,
         matters,
@@ -189,11 +186,11 @@ def draw(trap: Trap, noise: float, count: int, index: int, seed: int) -> Drawn:
         bool(trap.keys & outcome.keys) or (trap.matters == "attitudes" and right and outcome.trusted),
         outcome.verdict,
         tuple(sorted(outcome.keys)),
-        "" if other is None else other.verdict,
-        () if other is None else tuple(sorted(other.keys)),
-        other is None or is_sound(other, count, rows),
+        other.verdict,
+        tuple(sorted(other.keys)),
+        is_sound(other, count, rows),
         _inside(outcome, faulty),
-        (0, 0) if other is None or honest is None else _inside(other, honest),
+        _inside(other, honest),
     )
 
 
@@ -202,7 +199,7 @@ def _inside(outcome: Outcome, recording: Recording) -> tuple[int, int]:
     if outcome.result is None or not outcome.trusted:
         return 0, 0
     hits = inside(outcome.result, recording.truth)
-    return int(hits.sum()), len(hits)
+    return int(np.nansum(hits)), int(np.isfinite(hits).sum())
 
 
 def is_sound(honest: Outcome, count: int, rows: int) -> bool:
@@ -248,7 +245,7 @@ def table_of_traps(only: Sequence[str], number: int, seed: int, jobs: int, as_js
         all_cells.append(cell)
         if not as_json:
             print(f"| {' | '.join(cell.row())} |", flush=True)
-    honest = sum(len(cell.honest) for cell in all_cells)
+    honest = sum(len(cell.drawn) for cell in all_cells)
     unsound = sum(cell.unsound for cell in all_cells)
     passed = all(cell.passed for cell in all_cells) and unsound <= HONEST_ALL * honest
     if as_json:

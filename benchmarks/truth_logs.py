@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.sensor.model import ErrorModel
 from benchmarks.truth_scenes import Recording, Scene, random_sensor, spread, text_of, tilted, unit
 
-Pair = tuple[Recording, Recording | None]
+Pair = tuple[Recording, Recording]
 
 RATE, HOLD, MOVE = 50, 150, 60
 """Rows per second of a log; rows of a hold and of a move."""
@@ -52,7 +52,7 @@ def like(scene: Scene) -> ErrorModel:
     return ErrorModel(other.K * scene.size / size, other.D * scene.size / size)
 
 
-def force_of_log(scene: Scene, tremor: float = 0.0) -> tuple[Float, Float, Float]:
+def force_of_log(scene: Scene, tremor: float = 0.0) -> tuple[Float, Int, Bool]:
     """Return force, shape (n, 3), pose (0 in moves) and whether a row is a hold's of a log of the scene's poses."""
     rng, u = scene.rng, scene.rng.permutation(spread(scene.rng, scene.count))
     parts, pose = [], []
@@ -63,7 +63,7 @@ def force_of_log(scene: Scene, tremor: float = 0.0) -> tuple[Float, Float, Float
         pose.append(np.full(n, k + 1))
         if k + 1 < len(u):
             parts.append(_move(rng, here, u[k + 1], scene.g))
-            pose.append(np.zeros(MOVE))
+            pose.append(np.zeros(MOVE, dtype=int))
     whole = np.concatenate(pose)
     return np.concatenate(parts), whole, whole > 0
 
@@ -80,8 +80,8 @@ def _move(rng: Generator, a: Float, b: Float, g: float) -> Float:
 def log(
     scene: Scene,
     output: Float,
-    hold: Float,
-    pose: Float,
+    hold: Bool,
+    pose: Int,
     *,
     raw: bool = True,
     columns: Mapping[str, Iterable[object]] | None = None,
@@ -96,7 +96,6 @@ def log(
         columns={**time, **(columns or {})},
         raw=raw,
         plain=held if raw else output,
-        noise=scene.noise,
     )
 
 
@@ -112,7 +111,7 @@ def with_tremor(scene: Scene) -> Pair:
     return _of_forces(scene, lambda: force_of_log(scene, 0.02))
 
 
-def _of_forces(scene: Scene, forces: Callable[[], tuple[Float, Float, Float]]) -> Pair:
+def _of_forces(scene: Scene, forces: Callable[[], tuple[Float, Int, Bool]]) -> Pair:
     made = []
     for f, pose, hold in (forces(), force_of_log(scene)):
         made.append(log(scene, scene.model.output(f + scene.noises(len(f))), hold, pose))

@@ -163,8 +163,7 @@ class Scene:
         raw: bool = False,
         truth: ErrorModel | None = None,
         plain: Float | None = None,
-        noise: float | None = None,
-        **settings: object,
+        settings: Mapping[str, object] | None = None,
     ) -> Recording:
         """Return the recording of rows of output, shape (n, 3); `plain` is by default the means of labels."""
         table: dict[str, Iterable[object]] = dict(columns or {})
@@ -174,7 +173,12 @@ class Scene:
         if plain is None:
             plain = output if labels is None else means(output, labels)
         per_pose = len(output) / len(plain)
-        stated = {"optimizer": OPTIMIZER, "g": self.g, "weights": "auto" if raw else "none"} | settings
+        stated = {
+            "optimizer": OPTIMIZER,
+            "g": self.g,
+            "weights": "auto" if raw else "none",
+            **(settings or {}),
+        }
         return Recording(
             text_of(table, header),
             Settings(**stated),  # type: ignore[arg-type]
@@ -182,7 +186,7 @@ class Scene:
             self.g,
             raw,
             plain,
-            (self.noise if noise is None else noise) / np.sqrt(per_pose),
+            self.noise / np.sqrt(per_pose),
             known_noise=per_pose > 1,
         )
 
@@ -296,10 +300,10 @@ def half_widths(result: Calibration) -> tuple[Float, Float]:
     return np.asarray(interval.K_a), np.asarray(interval.D_a)
 
 
-def inside(result: Calibration, truth: ErrorModel) -> Bool:
-    """Return which of the 95 % intervals hold the truth, shape (p,)."""
+def inside(result: Calibration, truth: ErrorModel) -> Float:
+    """Return 1 for every 95 % interval that holds the truth, 0 for others, NaN for parameters without, shape (p,)."""
     error, half, _ = deviations(result, truth)
-    return np.asarray(np.abs(error) <= half)
+    return np.where(np.isfinite(half), np.abs(error) <= half, np.nan)
 
 
 def deviations(result: Calibration, truth: ErrorModel) -> tuple[Float, Float, Float]:

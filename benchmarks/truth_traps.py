@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.random import Generator
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.settings import Nominal
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
@@ -160,7 +160,7 @@ def changed(change: Callable[[Scene, Float, Float], Float]) -> Callable[[Scene],
     return make
 
 
-def chosen(scene: Scene, most: int) -> Float:
+def chosen(scene: Scene, most: int) -> Bool:
     """Return which rows belong to 1 to `most` random poses, as a mask."""
     hit = scene.rng.choice(scene.count, scene.rng.integers(1, most + 1), replace=False)
     return np.isin(np.arange(scene.count * scene.rows) // scene.rows, hit)
@@ -234,7 +234,7 @@ def spikes(scene: Scene, _: Float, output: Float) -> Float:
 def quantised(scene: Scene, _: Float, output: Float) -> Float:
     """Steps of 16 mg."""
     step = 16 * MILLI_G * scene.size
-    return np.round(output / step) * step
+    return np.asarray(np.round(output / step) * step)
 
 
 def nonlinear(power: int) -> Callable[[Scene, Float, Float], Float]:
@@ -242,7 +242,7 @@ def nonlinear(power: int) -> Callable[[Scene, Float, Float], Float]:
 
     def change(scene: Scene, f: Float, output: Float) -> Float:
         sign = scene.rng.choice([-1.0, 1.0], 3)
-        return output + sign * 0.005 * scene.size * scene.g * (f / scene.g) ** power
+        return np.asarray(output + sign * 0.005 * scene.size * scene.g * (f / scene.g) ** power)
 
     return change
 
@@ -250,7 +250,7 @@ def nonlinear(power: int) -> Callable[[Scene, Float, Float], Float]:
 def drifting(scene: Scene, _: Float, output: Float) -> Float:
     """Each bias drifts evenly by 10 to 40 mg through the session, through zero in its middle."""
     total = scene.rng.uniform(10, 40, 3) * scene.rng.choice([-1.0, 1.0], 3) * MILLI_G * scene.size
-    return output + np.linspace(-0.5, 0.5, len(output))[:, None] * total
+    return np.asarray(output + np.linspace(-0.5, 0.5, len(output))[:, None] * total)
 
 
 def mixed_units(scene: Scene) -> Pair:
@@ -271,8 +271,10 @@ def wrong_gravity(scene: Scene) -> Pair:
     f, z = held(scene, spread(scene.rng, scene.count))
     output, nominal = model.output(f + z), Nominal((size, size, size))
     off = scene.g * (1 + 0.01 * scene.rng.choice([-1, 1]))
-    faulty = scene.recording(output, scene.labels(), nominal=nominal, g=off, plain=scene.g / off * output)
-    return faulty, scene.recording(output, scene.labels(), nominal=nominal)
+    faulty = scene.recording(
+        output, scene.labels(), settings={"nominal": nominal, "g": off}, plain=scene.g / off * output
+    )
+    return faulty, scene.recording(output, scene.labels(), settings={"nominal": nominal})
 
 
 def g_in_cm(scene: Scene) -> Pair:
@@ -281,7 +283,7 @@ def g_in_cm(scene: Scene) -> Pair:
     scene = Scene(scene.rng, model, size, scene.g, scene.noise, scene.count, scene.rows)
     f, z = held(scene, spread(scene.rng, scene.count))
     output = model.output(f + z)
-    faulty = scene.recording(output, scene.labels(), g=100 * scene.g, plain=output / 100)
+    faulty = scene.recording(output, scene.labels(), settings={"g": 100 * scene.g}, plain=output / 100)
     return faulty, scene.recording(output, scene.labels())
 
 
@@ -333,12 +335,12 @@ def gyroscope_taken(scene: Scene) -> Pair:
     f, z = held(scene, spread(scene.rng, scene.count), 1)
     output, rates = scene.model.output(f + z), gyroscope(scene.rng, len(f))
     made = []
-    for columns in ("uvw", "xyz"):
+    for columns in (("u", "v", "w"), ("x", "y", "z")):
         table = {name: [f"{v:.5f}" for v in column] for name, column in zip("uvw", rates.T, strict=True)}
         table |= {
             name: [scene.digits(v) for v in column] for name, column in zip("xyz", output.T, strict=True)
         }
-        recording = replace(scene.recording(output), text=text_of(table), columns=tuple(columns))
+        recording = replace(scene.recording(output), text=text_of(table), columns=columns)
         made.append(recording)
     return made[0], made[1]
 
@@ -411,7 +413,7 @@ def _trap(name: str, make: Callable[[Scene], Pair], *keys: str, **more: object) 
 
 
 MOVED = ("tremor", "residuals", "correlated", "moved")
-MIRROR = ("mirrored", "negative", "handedness", "sign", "left-handed", "orientation")
+MIRROR = ("negative-axes", "mirrored", "negative", "handedness", "sign", "left-handed", "orientation")
 
 TRAPS: tuple[Trap, ...] = (
     *(_trap(f"cap of {a} degrees", attitudes(cap(a)), *POOR, matters="attitudes") for a in (20, 40, 60)),
