@@ -19,7 +19,7 @@ help:
 	@echo "make lint     ruff"
 	@echo "make types    mypy"
 	@echo "make bench    run the benchmarks; ARGS=optimizers only those of the optimizers"
-	@echo "make truth    the traps, 100 draws each, then coverage, weights, robust losses and verification: hours"
+	@echo "make truth    is a good result good? traps, coverage, weights, robust losses, verification: hours"
 	@echo "make docs     write the tables and outputs in the documentation anew"
 	@echo "make golden   write the frozen outputs of the commands anew"
 	@echo "make pictures draw the pictures of the optimizers anew"
@@ -42,11 +42,7 @@ bench: $(VENV)/installed-bench
 	$(BIN)/python -m benchmarks $(ARGS)
 
 truth: $(VENV)/installed-bench
-	$(BIN)/python -m benchmarks.truth $(ARGS)
-	$(BIN)/python -m benchmarks.truth --coverage $(ARGS)
-	$(BIN)/python -m benchmarks.truth --weights $(ARGS)
-	$(BIN)/python -m benchmarks.truth --robust $(ARGS)
-	$(BIN)/python -m benchmarks.truth --verify $(ARGS)
+	$(BIN)/python -m benchmarks.truth --all --write docs/explanation/trust.md $(ARGS)
 
 docs: $(VENV)/installed-test
 	$(BIN)/python tests/test_docs.py

@@ -12,21 +12,26 @@ themselves, or in the residuals of that plain fit. Of the draws in which it matt
 and of the honest counterparts the share that is not called good. `weak` counts as good for twelve single readings of
 which one has a leverage of 0.9 or more.
 
-    python -m benchmarks.truth [--draws N] [--only NAME] [--jobs N] [--seed N] [--json]
-    python -m benchmarks.truth --coverage | --weights | --robust | --verify
+    python -m benchmarks.truth [--draws N] [--only NAME] [--jobs N] [--seed N] [--json] [--write PAGE]
+    python -m benchmarks.truth --coverage | --weights | --robust | --verify | --all
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
+import re
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
+from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -232,7 +237,12 @@ def cells(traps: Sequence[Trap], number: int, seed: int, jobs: int) -> Iterator[
         yield cell
 
 
-def table_of_traps(only: Sequence[str], number: int, seed: int, jobs: int, as_json: bool) -> bool:
+DRAWS = 100
+REMARKS = "\nRemarks\n"
+"""Begins what is printed below a table and does not belong to it."""
+
+
+def table_of_traps(only: Sequence[str], number: int | None, seed: int, jobs: int, as_json: bool) -> bool:
     """Print the table of the traps whose names contain one of `only`; return whether all of it is as it should be."""
     traps = [trap for trap in TRAPS if not only or any(part in trap.name for part in only)]
     if not as_json:
@@ -241,7 +251,7 @@ def table_of_traps(only: Sequence[str], number: int, seed: int, jobs: int, as_js
         )
         print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     all_cells = []
-    for cell in cells(traps, number, seed, jobs):
+    for cell in cells(traps, number or DRAWS, seed, jobs):
         all_cells.append(cell)
         if not as_json:
             print(f"| {' | '.join(cell.row())} |", flush=True)
@@ -262,13 +272,12 @@ def table_of_traps(only: Sequence[str], number: int, seed: int, jobs: int, as_js
     print(f"\nHonest draws not called good: {unsound:,} of {honest:,} ({unsound / max(1, honest):.1%}).")
     for what, share in coverage_of(all_cells).items():
         print(f"95 % intervals that hold the truth, {what} draws called good or weak: {_percent(share, 1)}.")
+    print(REMARKS)
     if missed := [cell for cell in all_cells if not cell.passed]:
-        print("\nShort of 95 % judged right with the cause named, or beyond 4 % of honest draws not good:\n")
+        print("Short of 95 % judged right with the cause named, or beyond 4 % of honest draws not good:\n")
         for cell in missed:
             print(f"- {cell.trap}, {cell.noise:g} mg, {cell.attitudes:,} attitudes: {in_words(cell)}")
-    print("\nInvisible, and so left out:\n")
-    for what, why in INVISIBLE.items():
-        print(f"- {what}: {why}")
+    print(f"\nInvisible, and so left out:\n\n{invisible()}")
     return passed
 
 
@@ -286,10 +295,65 @@ def in_words(cell: Cell) -> str:
     return "; ".join(words)
 
 
+Study = Callable[[Sequence[str], int | None, int, int, bool], bool]
+"""Prints its table: rows, draws, seed, processes, whether as JSON; returns whether all is as it should be."""
+
+
+def studies() -> dict[str, Study]:
+    """Return the studies by name."""
+    from benchmarks.truth_checks import STUDIES
+    from benchmarks.truth_coverage import table_of_coverage
+
+    return {"traps": table_of_traps, "coverage": table_of_coverage, **STUDIES}
+
+
+class Tee(io.StringIO):
+    """Text that is also printed."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        self.stream.write(text)
+        return super().write(text)
+
+    def flush(self) -> None:
+        self.stream.flush()
+
+
+def filled(page: str, name: str, text: str) -> str:
+    """Return a page with the text between its mark of that name and the next end."""
+    mark = re.compile(rf"(<!-- truth: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+    if not mark.search(page):
+        raise ValueError(f"no place for {name} in the page")
+    return mark.sub(lambda match: f"{match[1]}{text.strip()}\n{match[2]}", page)
+
+
+def invisible() -> str:
+    """Return the faults that cannot be shown, as a list."""
+    return "\n".join(f"- **{what[0].upper()}{what[1:]}**: {why}." for what, why in INVISIBLE.items())
+
+
+def run(name: str, stated: argparse.Namespace) -> bool:
+    """Run a study and write its table where asked to."""
+    started = time.perf_counter()
+    shown = Tee(sys.stdout)
+    with contextlib.redirect_stdout(shown):
+        passed = studies()[name](stated.only, stated.draws, stated.seed, stated.jobs, stated.json)
+    if stated.write:
+        page = stated.write.read_text(encoding="utf-8")
+        page = filled(filled(page, name, shown.getvalue().split(REMARKS)[0]), "invisible", invisible())
+        stated.write.write_text(page, encoding="utf-8")
+    word = "as it should be" if passed else "not as it should be"
+    print(f"{name}: {time.perf_counter() - started:.0f} s, {word}", file=sys.stderr)
+    return passed
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.truth", description=__doc__.split("\n")[0])
     parser.add_argument(
-        "--draws", type=int, help="draws of each cell or class (100 of traps, 1000 of coverage)"
+        "--draws", type=int, help="draws of each row (traps and robust 100, weights 500, others 1000)"
     )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
@@ -297,25 +361,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--only", action="append", default=[], metavar="NAME", help="rows whose names contain it"
     )
     parser.add_argument("--json", action="store_true", help="figures of every row, with verdicts and keys")
-    for study in ("coverage", "weights", "robust", "verify"):
-        parser.add_argument(f"--{study}", dest="study", action="store_const", const=study)
-    stated = parser.parse_args(arguments)
-    started = time.perf_counter()
-    if stated.study is None:
-        passed = table_of_traps(stated.only, stated.draws or 100, stated.seed, stated.jobs, stated.json)
-    elif stated.study == "coverage":
-        from benchmarks.truth_coverage import table_of_coverage
-
-        passed = table_of_coverage(stated.only, stated.draws or 1000, stated.seed, stated.jobs, stated.json)
-    else:
-        from benchmarks.truth_checks import STUDIES
-
-        passed = STUDIES[stated.study](stated.only, stated.draws, stated.seed, stated.jobs, stated.json)
-    print(
-        f"{time.perf_counter() - started:.0f} s, {'as it should be' if passed else 'not as it should be'}",
-        file=sys.stderr,
+    parser.add_argument(
+        "--write", type=Path, metavar="PAGE", help="put the table into a page, docs/explanation/trust.md"
     )
-    return 0 if passed else 1
+    for study in ("coverage", "weights", "robust", "verify", "all"):
+        parser.add_argument(f"--{study}", dest="study", action="store_const", const=study, default="traps")
+    stated = parser.parse_args(arguments)
+    names = list(studies()) if stated.study == "all" else [stated.study]
+    failed = [name for name in names if not run(name, stated)]
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -346,8 +346,12 @@ def count(part: Part) -> Counts:
     return counts
 
 
-def table_of_coverage(only: Sequence[str], number: int, seed: int, jobs: int, as_json: bool) -> bool:
+DRAWS = 1000
+
+
+def table_of_coverage(only: Sequence[str], number: int | None, seed: int, jobs: int, as_json: bool) -> bool:
     """Print the coverage of every class whose name contains one of `only`; return whether all is as it should be."""
+    number = number or DRAWS
     kinds = [kind for kind in KINDS if not only or any(part in kind.name for part in only)]
     chunks = [range(first, min(first + CHUNK, number)) for first in range(0, number, CHUNK)]
     parts = [(kind.name, chunk, seed) for kind in kinds for chunk in chunks]

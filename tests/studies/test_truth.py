@@ -16,11 +16,12 @@ from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
 
-from benchmarks import truth, truth_checks, truth_coverage
-from benchmarks.truth_scenes import Scene, deviations, fault_of, holds, inside, observe, plain_fit, stream
-from benchmarks.truth_traps import TRAPS
+from benchmarks import truth, truth_checks, truth_coverage  # noqa: E402
+from benchmarks.truth_scenes import Scene, deviations, fault_of, holds, inside, observe, plain_fit, stream  # noqa: E402
+from benchmarks.truth_traps import TRAPS  # noqa: E402
 
 G, DRAWS, NOISE = 9.8, 3, 2.0
 
@@ -110,6 +111,21 @@ def test_the_table_says_what_it_counts(capsys):
     rows = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| corners")]
     assert len(rows) == 4
     assert all(row[4].strip() == "1" and row[5].strip() == "100%" for row in rows)
+
+
+def test_a_table_is_written_into_the_page(tmp_path, capsys):
+    page = tmp_path / "trust.md"
+    page.write_text((ROOT / "docs/explanation/trust.md").read_text(encoding="utf-8"), encoding="utf-8")
+    truth.main(["--draws", "1", "--only", "corners", "--jobs", "1", "--write", str(page)])
+    text = page.read_text(encoding="utf-8")
+    assert text.count("| corners only |") == 4
+    assert "Remarks" not in text
+    assert text.endswith("<!-- end -->\n")
+    assert capsys.readouterr().out.count("| corners only |") == 4
+
+
+def test_the_page_lists_the_invisible_faults():
+    assert truth.invisible() in (ROOT / "docs/explanation/trust.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["equal noise, 24 poses", "known attitudes", "temperature, weights auto"])
