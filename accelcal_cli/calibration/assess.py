@@ -198,8 +198,8 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         return (*lines, *_turned_round(fit.K[at]))
     walled = bool(fit.at_wall[at].any()) and fit.view[at].verdict != "undetermined"
     return (
-        *lines,
         *((WALLED,) if walled else ()),
+        *lines,
         *more_than_noise(*fit.noise[:, at].tolist()),
         *_noise_bias(s, settings.g, float(_scale_sigma(fit)[at])),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
