@@ -283,8 +283,8 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
     walled = bool(fit.at_wall[at].any()) and fit.geometry.observability[at].verdict != "undetermined"
     spread = fit.spread
     return (
-        *lines,
         *((WALLED,) if walled else ()),
+        *lines,
         *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at])),
         *_less_than_noise(fit, at),
         *_noise_bias(fit, at),
