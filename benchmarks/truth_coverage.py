@@ -175,12 +175,15 @@ def uneven(weights: str, low: int = 4, high: int = 1000, shared: float = 0.0) ->
     return make
 
 
-def warmed(**stated: object) -> Callable[[Generator], Case]:
-    """Return a class of poses at 15 to 45 degrees, of a sensor whose scale factors and biases go with temperature."""
+def warmed(low: int, high: int, **stated: object) -> Callable[[Generator], Case]:
+    """Return a class of 36 poses at 15 to 45 degrees, each the mean of `low` to `high` rows.
+
+    Scale factors and biases of the sensor go with temperature.
+    """
 
     def make(rng: Generator) -> Case:
         scene = scene_of(rng, 36)
-        read, n, scatter = summarised(rng, scene, 20, 3000, 0.2 * scene.noise)
+        read, n, scatter = summarised(rng, scene, low, high)
         degrees = rng.uniform(15, 45, scene.count)
         slopes = Slopes(1e-4 * rng.normal(size=3), 0.2 * MILLI_G * scene.size * rng.normal(size=3))
         t = (degrees - REFERENCE)[:, None]
@@ -248,10 +251,11 @@ KINDS: tuple[Kind, ...] = (
         for w in ("sd", "auto")
     ),
     *(Kind(f"n of 4 to 1 000, weights {w}", uneven(w)) for w in ("n", "sd", "auto")),
-    Kind("n of 4 to 1 000, shared error, weights auto", uneven("auto", shared=0.2)),
+    # An error that poses share beside their noise is one that the scatter does not explain: a verdict may withhold it.
+    Kind("n of 4 to 1 000, shared error, weights auto", uneven("auto", shared=0.2), each=False, withheld=1),
     *(Kind(f"{n} rows, weights sd", repeated(24, n, weights="sd")) for n in (2, 3)),
-    Kind("temperature, weights auto", warmed(weights="auto")),
-    Kind("temperature, no weights", warmed()),
+    Kind("temperature, n of 20 to 3 000, weights auto", warmed(20, 3000, weights="auto")),
+    Kind("temperature, n of 100", warmed(100, 100)),
     *(
         Kind(f"{loss}, {count} poses, {tail}", robust(loss, count, tail))
         for loss, count in (("huber", 24), ("huber", 60), ("soft-l1", 24))

@@ -128,7 +128,7 @@ def test_the_page_lists_the_invisible_faults():
     assert truth.invisible() in (ROOT / "docs/explanation/trust.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["equal noise, 24 poses", "known attitudes", "temperature, weights auto"])
+@pytest.mark.parametrize("name", ["equal noise, 24 poses", "known attitudes", "temperature, n of 100"])
 def test_coverage_of_honest_readings_is_near_its_level(name):
     counts = truth_coverage.count((name, range(40), 1))
     assert counts.withheld <= 0.05
