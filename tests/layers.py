@@ -37,6 +37,7 @@ INSIDE = {
         "distributions",
         "sample",
         "observability",
+        "engineering",
         "problem",
         "result",
         "search",

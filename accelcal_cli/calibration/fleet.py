@@ -15,7 +15,8 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.assess import Assessment
 from accelcal_cli.calibration.calibrate import assessed, faults, record
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
-from accelcal_cli.calibration.observability import MISALIGNMENT, PARAMETERS, ROWS_COLUMNS
+from accelcal_cli.calibration.engineering import chain, propagated, quantities
+from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
 from accelcal_cli.calibration.search import NO_NOISE
@@ -50,7 +51,8 @@ class Fleet:
     Attributes:
         number: the sensors' numbers among the readings, shape (R,); poses: J of each.
         K_a, D_a: in the gauge of the settings, shapes (R, 3, 3) and (R, 3); sigma_k, sigma_d: their one-sigma.
-        lower: K_a in gauge `lower`, shape (R, 3, 3).
+        quantities: the sensors as an engineer states them, see `calibration.engineering`, shape (R, 9); gain: their
+            errors, of sensitivities as a part of themselves, over the noise of a pose in m/s^2, shape (R, 9).
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
         verdict: good, weak, undetermined or failed, shape (R,); reason: why it is not good, in sentences.
@@ -64,7 +66,8 @@ class Fleet:
     D_a: Float
     sigma_k: Float
     sigma_d: Float
-    lower: Float
+    quantities: Float
+    gain: Float
     dop: Float
     cost: Float
     s: Float
@@ -167,7 +170,8 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         D_a=fit.D,
         sigma_k=fit.sigma_K,
         sigma_d=fit.sigma_D,
-        lower=fit.lower,
+        quantities=quantities(fit.lower, fit.D),
+        gain=propagated(chain(fit.lower, fit.D, fit.settings.g), fit.view.cofactor),
         dop=fit.dop,
         cost=fit.value,
         s=fit.s,
@@ -194,7 +198,8 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
         D_a=nan(3),
         sigma_k=nan(3, 3),
         sigma_d=nan(3),
-        lower=nan(3, 3),
+        quantities=nan(9),
+        gain=nan(9),
         dop=nan(9),
         cost=nan(),
         s=nan(),
@@ -235,25 +240,19 @@ class Standout:
 
 
 def parameters(fleet: Fleet, g: float) -> list[Quantity]:
-    """Return the nine parameters as an engineer takes them, gauge `lower`: K_ii, K_ij / K_ii, D_i / K_ii."""
-    per_unit = f"units per {'g' if g == 1.0 else 'm/s^2'}"
-    K, dop = fleet.lower, fleet.dop / g
-    scale = np.einsum("rii->ri", K)
-    mrad, micro_g = units.MRAD, units.MICRO_G
-    return [
-        *(
-            Quantity(f"scale factor {a}", per_unit, ".7g", scale[:, i], scale[:, i] * dop[:, i])
-            for i, a in enumerate("xyz")
-        ),
-        *(
-            Quantity(name, "mrad", ".3f", K[:, i, j] / scale[:, i] * mrad, dop[:, p] * mrad)
-            for p, name, (i, j) in zip((3, 4, 5), PARAMETERS[MISALIGNMENT], ROWS_COLUMNS[3:6], strict=True)
-        ),
-        *(
-            Quantity(f"bias {a}", "micro-g", ",.1f", bias * micro_g, dop[:, 6 + i] * micro_g)
-            for i, (a, bias) in enumerate(zip("xyz", (fleet.D_a / scale / g).T, strict=True))
-        ),
-    ]
+    """Return the nine parameters as an engineer takes them: sensitivities, misalignments, biases as force."""
+    kinds = (
+        (f"units per {'g' if g == 1.0 else 'm/s^2'}", ".7g", 1.0),
+        ("mrad", ".3f", units.MRAD),
+        ("micro-g", ",.1f", units.MICRO_G / g),
+    )
+    listed = []
+    for p, name in enumerate(PARAMETERS):
+        unit, shown, factor = kinds[p // 3]
+        values = fleet.quantities[:, p] * factor
+        size = values if p < 3 else factor
+        listed.append(Quantity(name, unit, shown, values, size * fleet.gain[:, p]))
+    return listed
 
 
 def noise(fleet: Fleet, g: float) -> Quantity:

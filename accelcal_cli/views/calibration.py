@@ -7,6 +7,8 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from accelcal_cli.arrays import Float
+from accelcal_cli.calibration import engineering as engineer
 from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, PARAMETERS, SCALE, UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration, Temperature
 from accelcal_cli.sensor import model as units
@@ -90,14 +92,13 @@ def engineering(result: Calibration) -> Table:
     """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
-    # In gauge lower, as their sigma: another gauge, above all the free rotation of gauge full, moves a scale factor
-    # by half the square of the misalignments, which is many times that sigma.
-    K = result.model.in_gauge("lower").K
-    angle = units.misalignment(K)
-    angles = [angle[i, j] + angle[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
-    bias = units.bias_force(K, result.D_a - result.nominal_bias) / per_g
-    values = np.concatenate([units.scale_error(K, result.nominal_scale), angles, bias])
-    sigma = np.sqrt(np.diagonal(result.covariance)) / per_g
+    offset = result.D_a - result.nominal_bias
+    values = engineer.quantities(result.K_a, offset)
+    sigma = engineering_sigma(result)
+    size = values[SCALE] / result.nominal_scale
+    values[SCALE], sigma[SCALE] = size - 1.0, size * sigma[SCALE]
+    values[BIAS] /= per_g
+    sigma[BIAS] /= per_g
     kinds = (
         ("scale factor error", "ppm", units.PPM, "%", 100.0),
         ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
@@ -121,6 +122,12 @@ def engineering(result: Calibration) -> Table:
     return Table("Engineering view", columns, tuple(rows), (_reference(result),))
 
 
+def engineering_sigma(result: Calibration) -> Float:
+    """Return one-sigma of the nine quantities of the engineering view, shape (9,); sensitivities as a part of them."""
+    change = engineer.chain(result.model.in_gauge("lower").K, result.D_a - result.nominal_bias, result.g)
+    return engineer.propagated(change, result.covariance)
+
+
 def _times(cell: object, factor: float) -> object:
     """Return a number times a factor; words and nothing as they are."""
     return cell * factor if isinstance(cell, float) else cell
@@ -133,14 +140,15 @@ def _reference(result: Calibration) -> str:
         nominal = ", ".join(f"{k:.6g}" for k in result.nominal_scale)
     offset = ", ".join(f"{d:g}" for d in result.nominal_bias) if result.nominal_bias.any() else "0"
     return (
-        f"Scale-factor errors against {nominal} output units per {result.unit}, biases against {offset} output units. "
+        f"Scale factor: sensitivity of the axis. Errors against {nominal} output units per {result.unit}, biases, as "
+        f"force along the axis, against {offset} output units. "
         "Misalignment: the angle by which two sensor axes miss 90 degrees."
     )
 
 
 def temperature(result: Calibration, slopes: Temperature) -> Table:
     """Return the change of scale factors and biases per degree."""
-    force = units.MICRO_G / np.diagonal(result.model.in_gauge("lower").K) / result.g
+    force = units.MICRO_G / units.sensitivity(result.K_a) / result.g
     rows = [
         (
             f"scale factor {AXES[i]}",
@@ -280,10 +288,10 @@ def pose_residuals(result: Calibration) -> Table:
 
 def accuracy(result: Calibration) -> str:
     """Say in one sentence how well the parameters are known; an empty text where the poses do not tell."""
-    variance = np.diagonal(result.covariance)
-    if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(variance).all():
+    sigma = engineering_sigma(result)
+    if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(sigma).all():
         return ""
-    sigma = np.sqrt(variance) / result.g
+    sigma[BIAS] /= result.g
     largest = [(name, sigma[kind].max() * size, unit) for name, kind, unit, size in KINDS]
     parts = [f"{name} {v:{'.2g' if v < 100 else ',.0f'}} {unit}" for name, v, unit in largest if v > 0]
     return f"Largest one-sigma of each kind: {', '.join(parts)}."

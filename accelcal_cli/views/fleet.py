@@ -107,7 +107,7 @@ def _spread(fleet: Fleet, g: float) -> Table:
             row = np.quantile(values, QUANTILES).tolist()
             rows.append((quantity.name, *(format(v, quantity.format) for v in row), quantity.unit))
     columns = ("quantity", "least", "5 %", "median", "95 %", "greatest", "unit")
-    note = "Scale factors, misalignments and biases in gauge lower, of the sensors that are good or weak."
+    note = "Scale factors, misalignments and biases as in the engineering view, of the sensors that are good or weak."
     return Table("Fleet", tuple(Column(name) for name in columns), tuple(rows), (note,))
 
 
