@@ -147,7 +147,7 @@ def test_scale_factors_misalignments_and_biases_by_hand():
 
 @given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
 def test_misalignments_are_what_two_axes_miss_of_90_degrees_in_any_gauge(off):
-    K = np.diag([3.0, 5.0, 4.0]) @ (np.eye(3) + [[0, *off[:2]], [off[2], 0, off[3]], [*off[4:], 0]])
+    K = np.diag([3.0, 5.0, 4.0]) @ (np.eye(3) + np.array([[0, *off[:2]], [off[2], 0, off[3]], [*off[4:], 0]]))
     rows = K / np.linalg.norm(K, axis=1)[:, None]
     missed = [np.pi / 2 - np.arccos(rows[i] @ rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
     for gauge in units.GAUGES:
