@@ -11,14 +11,14 @@ import subprocess
 import numpy as np
 import pytest
 import yaml
-from simulated import MEMS, readings
+from simulated import MEMS, readings, rotation
 
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, UsageError
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.exporters.mounting import Triad
-from accelcal_cli.io.readings import read_readings
+from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
@@ -45,6 +45,15 @@ def in_g():
 @pytest.fixture(scope="module")
 def counts():
     return result(COUNTS)
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """Known attitudes, mounted at random."""
+    turn = rotation(4)
+    u = G * poses.turns()
+    output = ErrorModel(MEMS.K @ turn, MEMS.D).output(u)
+    return calibrate(Readings.from_array(output, reference=u), Settings(g=G, attitudes="known"))
 
 
 def export(found, name, **options):
@@ -214,6 +223,26 @@ def test_imucal_corrects_with_two_matrices(which, unit, request):
     assert (record["cal_type"], record["_format_version"]) == ("Ferraris", "2.0.0")
     assert (record["acc_unit"], record["from_acc_unit"]) == (found.unit, unit)
     np.testing.assert_array_equal(record["K_g"], np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("which", "unit"), [("metres", "m/s^2"), ("in_g", "g"), ("counts", "a.u."), ("turned", "m/s^2")]
+)
+def test_imucal_itself_loads_and_applies_the_file(which, unit, request, tmp_path):
+    imucal = pytest.importorskip("imucal")
+    management = pytest.importorskip("imucal.management")
+    found = request.getfixturevalue(which)
+    path = tmp_path / "calibration.json"
+    path.write_bytes(export(found, "imucal").content)
+    info = management.load_calibration_info(path)
+    assert isinstance(info, imucal.FerrarisCalibrationInfo)
+    raw = READING * (415 if which == "counts" else 1)
+    gyroscope = np.array([[1.0, -2.0, 3.0]] * len(raw))
+    force, rate = info.calibrate(raw, gyroscope, acc_unit=unit, gyr_unit="deg/s")
+    np.testing.assert_allclose(force, found.model.specific_force(raw), rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(rate, gyroscope)
+    np.testing.assert_allclose(np.linalg.norm(info.R_a, axis=1), 1.0, rtol=1e-12)
+    assert info.acc_unit == found.unit
 
 
 @pytest.mark.parametrize("which", ["metres", "in_g", "counts"])
