@@ -38,6 +38,7 @@ INSIDE = {
         "sample",
         "observability",
         "engineering",
+        "triangle",
         "problem",
         "result",
         "search",

@@ -13,7 +13,8 @@ from simulated import DPSO, rotation
 
 from accelcal_cli.calibration import observability as quality
 from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, next_poses
-from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
+from accelcal_cli.calibration.problem import Box, Loetters, pack
+from accelcal_cli.calibration.triangle import compress_each
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.planning import FIXTURES, PRIOR, best_poses, candidates, distinct_poses, plan

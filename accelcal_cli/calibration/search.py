@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.problem import Loetters, compress, opened
+from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.optimization.minimize import Run, minimize, polish
 
 SAME_MINIMUM = 1e-6
