@@ -37,7 +37,6 @@ INSIDE = {
         "distributions",
         "sample",
         "observability",
-        "engineering",
         "triangle",
         "problem",
         "result",

@@ -15,8 +15,12 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.assess import Assessment
 from accelcal_cli.calibration.calibrate import assessed, faults, record
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
-from accelcal_cli.calibration.engineering import chain, propagated, quantities
-from accelcal_cli.calibration.observability import PARAMETERS
+from accelcal_cli.calibration.observability import (
+    PARAMETERS,
+    engineering_chain,
+    engineering_quantities,
+    propagated,
+)
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
 from accelcal_cli.calibration.search import NO_NOISE
@@ -51,7 +55,7 @@ class Fleet:
     Attributes:
         number: the sensors' numbers among the readings, shape (R,); poses: J of each.
         K_a, D_a: in the gauge of the settings, shapes (R, 3, 3) and (R, 3); sigma_k, sigma_d: their one-sigma.
-        quantities: the sensors as an engineer states them, see `calibration.engineering`, shape (R, 9); gain: their
+        quantities: the sensors as an engineer states them, see `engineering_quantities`, shape (R, 9); gain: their
             errors, of sensitivities as a part of themselves, over the noise of a pose in m/s^2, shape (R, 9).
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
@@ -170,8 +174,8 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         D_a=fit.D,
         sigma_k=fit.sigma_K,
         sigma_d=fit.sigma_D,
-        quantities=quantities(fit.lower, fit.D),
-        gain=propagated(chain(fit.lower, fit.D, fit.settings.g), fit.view.cofactor),
+        quantities=engineering_quantities(fit.lower, fit.D),
+        gain=propagated(engineering_chain(fit.lower, fit.D, fit.settings.g), fit.view.cofactor),
         dop=fit.dop,
         cost=fit.value,
         s=fit.s,

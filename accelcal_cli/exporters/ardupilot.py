@@ -13,7 +13,8 @@ import numpy as np
 
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
+from accelcal_cli.exporters.base import EXPORTERS, INSTANCE
+from accelcal_cli.exporters.diagonal import DiagonalExporter
 from accelcal_cli.schema import setting
 from accelcal_cli.sensor.poses import AXES
 

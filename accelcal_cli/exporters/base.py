@@ -16,18 +16,13 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
-from accelcal_cli.exporters.mounting import Triad, angle
 from accelcal_cli.registry import Registry
 from accelcal_cli.schema import Checked, setting
 from accelcal_cli.sensor.model import (
-    AXIS_PAIRS,
-    MRAD,
     STANDARD_GRAVITY,
     ErrorModel,
-    misalignment,
     sensitivity,
 )
-from accelcal_cli.sensor.poses import AXES
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -121,63 +116,6 @@ class DriverExporter(Exporter):
                 f"m/s^2; state with --driver-scale how many the driver takes for 1 m/s^2"
             )
         return ErrorModel(result.K_a, result.D_a * metres)
-
-
-@dataclass(frozen=True)
-class DiagonalExporter(DriverExporter):
-    """Base of the formats of targets that correct axis by axis, know no misalignments, and turn the board afterwards.
-
-    They get the sensor's own triad of axes, and the mounting of known attitudes apart from it.
-    """
-
-    orientation: ClassVar[str]
-    """The target's parameter of the board orientation, one of `mounting.ORIENTATIONS`."""
-
-    def triad(self, result: Calibration) -> tuple[Float, Triad]:
-        """Return the offset, m/s^2, shape (3,), and the triad of readings in m/s^2."""
-        model = self.in_metres(result)
-        return model.D, Triad.of(model.K)
-
-    def notes(self, result: Calibration) -> list[str]:
-        """Return lines for the file: the error that is left, the mounting where it is known, and the warnings."""
-        triad, metres = Triad.of(result.K_a), result.g * metres_per_unit(result)
-        mounting = self._mounting(result, triad)
-        return [
-            "Scales: of the sensor's own axes, with the least rms error over all directions that a scale for each axis "
-            f"can leave: {triad.rms * metres:.3g} m/s^2 at 1 g, at most {triad.worst * metres:.3g} m/s^2.",
-            *(f"Mounting, not in the numbers: {text}." for text in mounting),
-            *(f"Warning: {text}." for text in self._left_out(result, triad)),
-        ]
-
-    def warnings(self, result: Calibration) -> tuple[str, ...]:
-        """Return the misalignments and the mounting that are left out, and what all formats leave out."""
-        triad = Triad.of(result.K_a)
-        turned = triad.mirrored or angle(triad.axes) > STRAIGHT
-        mounting = self._mounting(result, triad) if turned else ()
-        told = (f"the mounting is not in the numbers: {text}" for text in mounting)
-        return (*self._left_out(result, triad), *told)
-
-    def _mounting(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
-        return (triad.in_words(self.orientation),) if is_mounted(result) else ()
-
-    def _left_out(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
-        further = super().warnings(result)
-        if result.held.any():
-            return further
-        missed, metres = misalignment(result.K_a), result.g * metres_per_unit(result)
-        k = int(np.abs(missed).argmax())
-        i, j = AXIS_PAIRS[k]
-        size = abs(float(missed[k]))
-        return (
-            f"this format has no misalignments: axes {AXES[i]} and {AXES[j]} miss 90 degrees by {size * MRAD:.3g} "
-            f"mrad ({size:.3f} rad), an error of {triad.rms * metres:.2g} m/s^2 rms over all directions and up to "
-            f"{triad.worst * metres:.2g} m/s^2 at 1 g",
-            *further,
-        )
-
-
-STRAIGHT = 1.0
-"""Degrees between the axes of the log and the body frame up to which a mounting is not told of."""
 
 
 def is_mounted(result: Calibration) -> bool:

@@ -8,8 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration import engineering as engineer
-from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, PARAMETERS, SCALE, UNDETERMINED, WEAK
+from accelcal_cli.calibration.observability import (
+    BIAS,
+    MISALIGNMENT,
+    PARAMETERS,
+    SCALE,
+    UNDETERMINED,
+    WEAK,
+    engineering_chain,
+    engineering_quantities,
+    propagated,
+)
 from accelcal_cli.calibration.result import Calibration, Temperature
 from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.poses import AXES
@@ -64,8 +73,8 @@ def parameters(result: Calibration) -> Table:
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
             "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
-            "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
-            "gauge lower and the bias."
+            "chose it. Observable, and with a sigma in the next table, are the scale factors of the axes, the angles "
+            "between them and the bias."
         )
     return Table("Calibration", (Column("axis"), *chain.from_iterable(columns)), rows, tuple(notes))
 
@@ -93,7 +102,7 @@ def engineering(result: Calibration) -> Table:
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
     offset = result.D_a - result.nominal_bias
-    values = engineer.quantities(result.K_a, offset)
+    values = engineering_quantities(result.K_a, offset)
     sigma = engineering_sigma(result)
     size = values[SCALE] / result.nominal_scale
     values[SCALE], sigma[SCALE] = size - 1.0, size * sigma[SCALE]
@@ -124,8 +133,8 @@ def engineering(result: Calibration) -> Table:
 
 def engineering_sigma(result: Calibration) -> Float:
     """Return one-sigma of the nine quantities of the engineering view, shape (9,); sensitivities as a part of them."""
-    change = engineer.chain(result.model.in_gauge("lower").K, result.D_a - result.nominal_bias, result.g)
-    return engineer.propagated(change, result.covariance)
+    change = engineering_chain(result.model.in_gauge("lower").K, result.D_a - result.nominal_bias, result.g)
+    return propagated(change, result.covariance)
 
 
 def _times(cell: object, factor: float) -> object:

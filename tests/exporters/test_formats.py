@@ -17,7 +17,7 @@ from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, UsageError
 from accelcal_cli.exporters.base import EXPORTERS
-from accelcal_cli.exporters.mounting import Triad
+from accelcal_cli.exporters.diagonal import Triad
 from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel

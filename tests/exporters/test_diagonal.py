@@ -10,7 +10,7 @@ from simulated import noise
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.exporters.base import EXPORTERS
-from accelcal_cli.exporters.mounting import ORIENTATIONS, Triad, angle, roll_pitch_yaw, rotation
+from accelcal_cli.exporters.diagonal import ORIENTATIONS, Triad, angle, roll_pitch_yaw, rotation
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
