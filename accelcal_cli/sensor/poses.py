@@ -156,7 +156,8 @@ def describe(direction: Float) -> str:
 
 
 UP_OR_DOWN = re.compile(
-    r"(?<![a-z0-9])(?P<sign>[+-]?)(?P<axis>[xyz])[\s_-]*(?:axis[\s_-]*)?(?P<way>up|down)(?![a-z])", re.IGNORECASE
+    r"(?<![a-z0-9])(?P<sign>[+-]?)(?P<axis>[xyz])[\s_-]*(?:axis[\s_-]*)?(?P<way>up|down)(?![a-z])",
+    re.IGNORECASE,
 )
 """What in a label says which way a sensor axis points: "+x up", "-z up", "x_down", "Y axis up"."""
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
-from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import (
     BIAS,
     MISALIGNMENT,
@@ -15,9 +13,6 @@ from accelcal_cli.calibration.observability import (
     SCALE,
     UNDETERMINED,
     WEAK,
-    engineering_chain,
-    engineering_quantities,
-    propagated,
 )
 from accelcal_cli.calibration.result import Calibration, Temperature
 from accelcal_cli.sensor import model as units
@@ -31,7 +26,13 @@ KINDS = (
 )
 """Kinds of parameters with the unit that their sigma is shown in, and its size in parts of g."""
 
+KEYS = ("scale_factor_error", "misalignment", "bias")
+"""Names of the kinds in CSV."""
+
 WORST_SHOWN = 5
+INTERVAL = "+- 95 %"
+"""Heading of the half-widths of 95 % intervals."""
+
 UNKNOWN, ASSUMED = "not determined", "taken as 0"
 
 
@@ -50,64 +51,54 @@ def blocks(result: Calibration) -> list[Block]:
     """Return what a calibration shows: verdict first, then tables, notes and convergence."""
     title = f"Convergence of {result.optimizer} (best cost L so far, logarithmic)"
     curve = [Convergence(title, {"": result.convergence})] if len(result.convergence) > 1 else []
-    conclusion = Conclusion(result.verdict, result.reasons, result.cautions)
+    conclusion = Conclusion(result.verdict, result.reasons, result.warnings)
     return [conclusion, BLANK, *tables(result), *notes(result.notes), *curve]
 
 
 def parameters(result: Calibration) -> Table:
-    """Return K_a and D_a with their one-sigma."""
-    lost = _undetermined(result)
-    entries = [  # value, sigma and whether it is lost, of a row of K_a and then the bias
+    """Return K_a and D_a with their 95 % intervals."""
+    lost, interval = result.lost_entries, result.interval
+    entries = [  # value, interval and whether it is lost, of a row of K_a and then the bias
         np.column_stack(pair)
-        for pair in ((result.K_a, result.D_a), (result.sigma.K_a, result.sigma.D_a), (lost[:3], lost[3]))
+        for pair in ((result.K_a, result.D_a), (interval.K_a, interval.D_a), (lost[:3], lost[3]))
     ]
     rows = tuple(
         (axis, *chain.from_iterable(_pair(v, s, lost=bool(gone)) for v, s, gone in zip(*row, strict=True)))
         for axis, *row in zip(AXES, *entries, strict=True)
     )
     columns = [
-        (Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}", beside=True))
+        (Column(name, format=".8g"), Column(INTERVAL, format=".2g", key=f"interval_{name}", beside=True))
         for name in ("K_x", "K_y", "K_z", "bias")
     ]
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
+    if result.coverage_factor is not None:
+        notes.append(
+            f"{INTERVAL}: half of the 95 % interval, {result.coverage_factor:.3g} sigma (Student's t)."
+        )
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
             "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
-            "chose it. Observable, and with a sigma in the next table, are the scale factors of the axes, the angles "
-            "between them and the bias."
+            "chose it. Observable, and with an interval in the next table, are the scale factors of the axes, the "
+            "angles between them and the bias."
         )
     return Table("Calibration", (Column("axis"), *chain.from_iterable(columns)), rows, tuple(notes))
 
 
-def _undetermined(result: Calibration) -> NDArray[np.bool_]:
-    """Return which entries of K_a (rows 0 to 2) and D_a (row 3) the poses leave undetermined, shape (4, 3)."""
-    nine = result.lost
-    lost = np.zeros((4, 3), dtype=bool)
-    for p, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))):
-        lost[i, j] = lost[j, i] = nine[p]
-    lost[3] = nine[6:]
-    lost[:3] &= result.K_a != 0  # a zero of the gauge is exact
-    return lost
-
-
-def _pair(value: float, sigma: float, *, lost: bool) -> list[object]:
-    """Return a value and its sigma, or that the poses do not determine it."""
+def _pair(value: float, interval: float, *, lost: bool) -> list[object]:
+    """Return a value and its interval, or that the poses do not determine it."""
     if lost:
         return [UNKNOWN, None]
-    return [value, sigma if np.isfinite(sigma) else None]
+    return [value, interval if np.isfinite(interval) else None]
 
 
 def engineering(result: Calibration) -> Table:
     """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
-    offset = result.D_a - result.nominal_bias
-    values = engineering_quantities(result.K_a, offset)
-    sigma = engineering_sigma(result)
-    size = values[SCALE] / result.nominal_scale
-    values[SCALE], sigma[SCALE] = size - 1.0, size * sigma[SCALE]
+    values, sigma = result.engineering
     values[BIAS] /= per_g
-    sigma[BIAS] /= per_g
+    interval = result.interval_of(sigma)
+    interval[BIAS] /= per_g
     kinds = (
         ("scale factor error", "ppm", units.PPM, "%", 100.0),
         ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
@@ -116,25 +107,19 @@ def engineering(result: Calibration) -> Table:
     rows = []
     for p, name in enumerate(PARAMETERS):
         kind, unit, factor, second, second_factor = kinds[p // 3]
-        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], sigma[p], lost=bool(result.lost[p]))
+        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], interval[p], lost=bool(result.lost[p]))
         first, other = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
         rows.append((f"{kind} {name.split()[-1]}", *first, unit, *other, second))
     columns = (
         Column("parameter"),
         Column("value", format=",.6g"),
-        Column("sigma", format=",.3g", beside=True),
+        Column(INTERVAL, format=",.3g", key="interval", beside=True),
         Column("unit", beside=True),
         Column("value", format=",.6g", key="value_2"),
-        Column("sigma", format=",.3g", key="sigma_2", beside=True),
+        Column(INTERVAL, format=",.3g", key="interval_2", beside=True),
         Column("unit", key="unit_2", beside=True),
     )
     return Table("Engineering view", columns, tuple(rows), (_reference(result),))
-
-
-def engineering_sigma(result: Calibration) -> Float:
-    """Return one-sigma of the nine quantities of the engineering view, shape (9,); sensitivities as a part of them."""
-    change = engineering_chain(result.model.in_gauge("lower").K, result.D_a - result.nominal_bias, result.g)
-    return propagated(change, result.covariance)
 
 
 def _times(cell: object, factor: float) -> object:
@@ -162,19 +147,24 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
         (
             f"scale factor {AXES[i]}",
             slopes.scale[i] * units.PPM,
-            slopes.sigma_scale[i] * units.PPM,
+            slopes.interval_scale[i] * units.PPM,
             "ppm per degree",
         )
         for i in range(3)
     ]
     rows += [
-        (f"bias {AXES[i]}", slopes.bias[i] * force[i], slopes.sigma_bias[i] * force[i], "micro-g per degree")
+        (
+            f"bias {AXES[i]}",
+            slopes.bias[i] * force[i],
+            slopes.interval_bias[i] * force[i],
+            "micro-g per degree",
+        )
         for i in range(3)
     ]
     columns = (
         Column("parameter"),
         Column("slope", format=",.2f"),
-        Column("sigma", format=",.2f", beside=True),
+        Column(INTERVAL, format=",.2f", key="interval", beside=True),
         Column("unit"),
     )
     note = (
@@ -188,9 +178,9 @@ def fit(result: Calibration) -> Table:
     """Return how well the readings fit."""
     unit = result.unit
     polished = [("cost L after polish", f"{result.cost:.9g}", f"({unit})^4")]
-    chance = result.noise_ratio is not None and [
-        ("residual noise / noise expected from the readings", f"{result.noise_ratio:.3g}", ""),
-        ("p-value", f"{result.noise_chance:.2g}", ""),
+    chance = result.residual_noise_ratio is not None and [
+        ("residual noise / noise expected from the readings", f"{result.residual_noise_ratio:.3g}", ""),
+        ("p-value", f"{result.residual_noise_p:.2g}", ""),
     ]
     rows = (
         ("rms of |f| - g before", f"{result.rms_before:.6g}", unit),
@@ -253,27 +243,48 @@ def worst_poses(result: Calibration) -> Table:
 
 def values(result: Calibration) -> Table:
     """Return one row per parameter, for CSV; one that is not determined has no value."""
-    lost = _undetermined(result)
+    lost = result.lost_entries
     names = [f"K_{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)] + ["D_1", "D_2", "D_3"]
     entries = (
         np.concatenate([result.K_a, [result.D_a]]),
         np.concatenate([result.sigma.K_a, [result.sigma.D_a]]),
+        np.concatenate([result.interval.K_a, [result.interval.D_a]]),
     )
     units_ = [f"output units per {result.unit}"] * 9 + ["output units"] * 3
     rows: list[tuple[object, ...]] = [
-        (name, None if gone else value, None if gone else sigma, unit)
-        for name, value, sigma, gone, unit in zip(
+        (name, *((None,) * 3 if gone else numbers), unit)
+        for name, *numbers, gone, unit in zip(
             names, *(e.ravel().tolist() for e in entries), lost.ravel().tolist(), units_, strict=True
         )
     ]
+    rows += _engineering_values(result)
     rows += [
-        ("cost", result.cost, None, f"({result.unit})^4"),
-        ("rms", result.rms, None, result.unit),
-        ("g", result.g, None, result.unit),
-        ("verdict", result.verdict, None, ""),
+        ("cost", result.cost, None, None, f"({result.unit})^4"),
+        ("rms", result.rms, None, None, result.unit),
+        ("g", result.g, None, None, result.unit),
+        ("coverage_factor", result.coverage_factor, None, None, ""),
+        ("verdict", result.verdict, None, None, ""),
     ]
-    columns = (Column("parameter"), Column("value"), Column("sigma"), Column("unit"))
+    columns = (Column("parameter"), Column("value"), Column("sigma"), Column("interval"), Column("unit"))
     return Table("Calibration", columns, tuple(rows))
+
+
+def _engineering_values(result: Calibration) -> list[tuple[object, ...]]:
+    """Return the engineering view as rows for CSV: name, value, sigma, interval, unit."""
+    values, sigma = result.engineering
+    table = np.stack([values, sigma, result.interval_of(sigma)])
+    table[:, BIAS] /= result.g
+    table[:, result.lost | result.held] = np.nan
+    names = [f"{kind}_{name.split()[-1]}" for kind, name in zip(np.repeat(KEYS, 3), PARAMETERS, strict=True)]
+    rows: list[tuple[object, ...]] = []
+    for p, (name, column) in enumerate(zip(names, table.T, strict=True)):
+        *_, unit, size = KINDS[p // 3]
+        rows.append((name, *(_finite(v * size) for v in column.tolist()), unit))
+    return rows
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def pose_residuals(result: Calibration) -> Table:
@@ -297,13 +308,15 @@ def pose_residuals(result: Calibration) -> Table:
 
 def accuracy(result: Calibration) -> str:
     """Say in one sentence how well the parameters are known; an empty text where the poses do not tell."""
-    sigma = engineering_sigma(result)
-    if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(sigma).all():
+    values, sigma = result.engineering
+    interval = result.interval_of(sigma)
+    interval[SCALE] /= 1.0 + values[SCALE]
+    interval[BIAS] /= result.g
+    if result.verdict == "undetermined" or not np.isfinite(interval).all():
         return ""
-    sigma[BIAS] /= result.g
-    largest = [(name, sigma[kind].max() * size, unit) for name, kind, unit, size in KINDS]
+    largest = [(name, interval[kind].max() * size, unit) for name, kind, unit, size in KINDS]
     parts = [f"{name} {v:{'.2g' if v < 100 else ',.0f'}} {unit}" for name, v, unit in largest if v > 0]
-    return f"Largest one-sigma of each kind: {', '.join(parts)}."
+    return f"Largest half of a 95 % interval of each kind: {', '.join(parts)}."
 
 
 def headline(result: Calibration) -> list[tuple[str, str]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from simulated import noise, readings
@@ -15,6 +17,7 @@ from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 from accelcal_cli.views.calibration import engineering as engineering_view
+from accelcal_cli.views.calibration import values
 
 G = 9.8
 SKEWED = ErrorModel(
@@ -95,9 +98,31 @@ def test_a_fleet_states_the_same_quantities(tmp_path):
     for r, one in records.items():
         rows = engineering_view(one).rows
         for p, quantity in enumerate(shown):
-            value, sigma = rows[p][1:3]
+            value, sigma = rows[p][1], rows[p][2] / one.coverage_factor
             if p < 3:
                 value = (1.0 + value * 1e-6) * one.nominal_scale[p]
                 sigma = sigma * 1e-6 * one.nominal_scale[p]
             assert quantity.values[r] == pytest.approx(value, rel=1e-9)
             assert quantity.gain[r] * one.s == pytest.approx(sigma, rel=1e-9)
+
+
+def test_csv_and_json_state_the_same_quantities():
+    result = calibrate(readings(poses.turns(), sigma=1e-3), Settings(optimizer="levenberg-marquardt", g=G))
+    table = {row[0]: row[1:] for row in engineering_view(result).rows}
+    csv = {row[0]: row[1:] for row in values(result).rows}
+    view = json.loads(json.dumps(result.record()))["engineering"]
+    for kind, key, size in (
+        ("scale factor error", "scale_error", 1e6),
+        ("misalignment", "misalignment", 1e3),
+    ):
+        for k, name in enumerate(("x", "y", "z") if size == 1e6 else ("xy", "xz", "yz")):
+            value, interval = table[f"{kind} {name}"][:2]
+            row = csv[f"{kind.replace(' ', '_')}_{name}"]
+            assert row[0] == pytest.approx(value, rel=1e-12)
+            assert row[2] == pytest.approx(interval, rel=1e-12)
+            assert view[key]["value"][k] * size == pytest.approx(value, rel=1e-12)
+            assert view[key]["sigma"][k] * size == pytest.approx(row[1], rel=1e-12)
+            assert view[key]["interval"][k] * size == pytest.approx(interval, rel=1e-12)
+    for k, axis in enumerate("xyz"):
+        assert csv[f"bias_{axis}"][0] == pytest.approx(table[f"bias {axis}"][0], rel=1e-12)
+        assert view["bias"]["value"][k] / G * 1e6 == pytest.approx(table[f"bias {axis}"][0], rel=1e-12)

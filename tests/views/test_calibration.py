@@ -44,18 +44,19 @@ def test_parameters_are_the_matrix_and_the_bias(result):
     for i, axis in enumerate("xyz"):
         values = rows[axis]
         np.testing.assert_array_equal(values[0:6:2], result.K_a[i])
-        np.testing.assert_array_equal(values[1:6:2], result.sigma.K_a[i])
-        assert tuple(values[6:]) == (result.D_a[i], result.sigma.D_a[i])
+        np.testing.assert_array_equal(values[1:6:2], result.interval.K_a[i])
+        assert tuple(values[6:]) == (result.D_a[i], result.interval.D_a[i])
 
 
 def test_the_engineering_view_by_hand(result):
     rows = _cells(tables.engineering(result))
-    sigma, lengths = tables.engineering_sigma(result), np.linalg.norm(result.K_a, axis=1)
+    sigma = result.coverage_factor * result.engineering[1]
+    lengths = np.linalg.norm(result.K_a, axis=1)
     value, one_sigma, unit, percent, _, second = rows["scale factor error y"]
     assert (unit, second) == ("ppm", "%")
     assert value == pytest.approx((lengths[1] / 5.6e5 - 1) * 1e6, rel=1e-9)
     assert percent == pytest.approx(value / 1e4, rel=1e-12)
-    assert one_sigma == pytest.approx(sigma[1] * lengths[1] / 5.6e5 * 1e6, rel=1e-9)
+    assert one_sigma == pytest.approx(sigma[1] * 1e6, rel=1e-9)
     value, one_sigma, unit, arcsec, _, second = rows["misalignment yz"]
     assert (unit, second) == ("mrad", "arcsec")
     cosine = result.K_a[1] @ result.K_a[2] / lengths[1] / lengths[2]
@@ -131,7 +132,9 @@ def test_what_is_not_determined_is_not_shown_as_a_number():
     assert {row[2] for row in tables.observability(result).rows} >= {"undetermined", "good"}
     empty = {row[0] for row in tables.values(result).rows if row[1] is None}
     below = {f"K_{i}{j}" for i in (1, 2, 3) for j in range(1, i + 1)}
-    assert empty == below | {"D_1", "D_2", "D_3"}
+    engineering = {f"{kind}_{axis}" for kind in ("scale_factor_error", "bias") for axis in "xyz"}
+    engineering |= {f"misalignment_{pair}" for pair in ("xy", "xz", "yz")}
+    assert empty == below | {"D_1", "D_2", "D_3"} | engineering
 
 
 def test_nine_poses_have_values_without_sigma():
