@@ -11,6 +11,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import LOOKED_AT, RAW_ROWS, Readings, may_be_doubtful
+from accelcal_cli.sensor.poses import axis_up
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -35,6 +36,13 @@ NORMAL_MAD = 1.4826
 
 SCALE_SAMPLE = 100_000
 """At most about this many residuals decide the scale of a robust loss."""
+
+
+def _names_up(readings: Readings) -> bool:
+    """Whether a pose's name says which way an axis points."""
+    poses = range(min(readings.poses, LOOKED_AT))
+    labelled = readings.where(0).startswith("position ")  # else it is the number of a line
+    return labelled and any(axis_up(readings.where(pose)) is not None for pose in poses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +92,7 @@ class Sample:
             lower=np.stack([one.lower for one in readings]),
             upper=np.stack([one.upper for one in readings]),
             blocks=blocks,
-            doubtful=np.array([bool(one.warnings) for one in readings]),
+            doubtful=np.array([bool(one.warnings) or _names_up(one) for one in readings]),
             readings=readings.__getitem__,
             count=stack("count"),
             scatter=stack("scatter"),
@@ -101,7 +109,7 @@ class Sample:
             lower=batch.output.min(axis=1),
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
-            doubtful=doubtful,
+            doubtful=doubtful | _names_up(fleet.one(batch, 0)),  # one table, one kind of labels
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
             scatter=batch.scatter,

@@ -120,6 +120,9 @@ SURELY_FILLED = 0.1
 """Largest standard deviation of the squared extents of such an ellipsoid, as a part of them: noise in an axis that does
 not answer fits ellipsoids as flat as it likes, and none so surely."""
 
+MOST_UNLIKE = 2000.0
+"""Largest factor between the extents of two axes: g beside mg is 1000, and beyond that a column is no axis."""
+
 LEAST_SPREAD = 0.25
 """Least eigenvalue of the correlation of such readings: 1 for a sphere all over, 0 where they lie in a plane."""
 
@@ -150,6 +153,7 @@ def _of_unit_extent(triangle: Triangle) -> tuple[Float, Float]:
     variance = np.einsum("rii->ri", covariance)
     usable = (variance > 0).all(axis=1) & (triangle.poses > 9)
     extent = np.sqrt(3.0 * np.where(usable[:, None], variance, 1.0))  # of a sphere all over
+    usable &= extent.max(axis=1) < MOST_UNLIKE * extent.min(axis=1)
     correlation = 3.0 * covariance / (extent[:, :, None] * extent[:, None, :])
     usable &= np.linalg.eigvalsh(np.where(usable[:, None, None], correlation, 0.0))[:, 0] > LEAST_SPREAD
     factor = rows(1.0 / extent[:, None])[:, 0, :9]

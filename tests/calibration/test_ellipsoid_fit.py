@@ -124,6 +124,11 @@ def _scaled(factors, seed=None):
 FACTORS = [(1, 1, 5), (5, 1, 1), (1, 20, 3), (1, 1, 100)]
 
 
+def test_a_column_of_another_size_is_no_axis():
+    K, _ = _fit(_scaled((1, 1, 1e5)).output(G * poses.turns()))
+    assert np.isnan(K).all()
+
+
 @pytest.mark.parametrize("factors", FACTORS)
 @pytest.mark.parametrize("scheme", ["edges", "turns", "icosahedron"])
 def test_axes_of_very_different_scale_are_fitted(factors, scheme):
