@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -38,11 +38,13 @@ SCALE_SAMPLE = 100_000
 """At most about this many residuals decide the scale of a robust loss."""
 
 
-def _names_up(readings: Readings) -> bool:
+def _name_up(where: Callable[[int], str], poses: Iterable[int]) -> bool:
     """Whether a pose's name says which way an axis points."""
-    poses = range(min(readings.poses, LOOKED_AT))
-    labelled = readings.where(0).startswith("position ")  # else it is the number of a line
-    return labelled and any(axis_up(readings.where(pose)) is not None for pose in poses)
+    names = (where(pose) for pose in poses)
+    first = next(names, "")
+    if not first.startswith("position "):  # the number of a line, as are all others
+        return False
+    return axis_up(first) is not None or any(axis_up(name) is not None for name in names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +94,12 @@ class Sample:
             lower=np.stack([one.lower for one in readings]),
             upper=np.stack([one.upper for one in readings]),
             blocks=blocks,
-            doubtful=np.array([bool(one.warnings) or _names_up(one) for one in readings]),
+            doubtful=np.array(
+                [
+                    bool(one.warnings) or _name_up(one.where, range(min(one.poses, LOOKED_AT)))
+                    for one in readings
+                ]
+            ),
             readings=readings.__getitem__,
             count=stack("count"),
             scatter=stack("scatter"),
@@ -104,12 +111,14 @@ class Sample:
     def of_batch(cls, fleet: FleetReadings, batch: Batch) -> Sample:
         """Return the sample of a batch of a fleet."""
         doubtful = may_be_doubtful(batch.output[:, :LOOKED_AT], batch.count) | (batch.count >= RAW_ROWS)
+        if _name_up(fleet.where, batch.pose[:1].ravel().tolist()):  # one table, one kind of labels
+            doubtful[:] = True
         return cls(
             poses=batch.count,
             lower=batch.output.min(axis=1),
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
-            doubtful=doubtful | _names_up(fleet.one(batch, 0)),  # one table, one kind of labels
+            doubtful=doubtful,
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
             scatter=batch.scatter,
