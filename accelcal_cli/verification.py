@@ -28,10 +28,11 @@ from accelcal_cli.calibration.observability import (
     Observability,
     design,
 )
-from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
+from accelcal_cli.calibration.problem import Box, Loetters, pack
 from accelcal_cli.calibration.residuals import beyond_chance, length_error, leverages, room_of, studentise
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.notices import Notice, are_serious

@@ -15,10 +15,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.consensus import consensus
-from accelcal_cli.calibration.problem import Loetters, compress, opened
+from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.calibration.weights import (
     SURELY_TREMBLES,
     PoseNoise,
