@@ -207,7 +207,8 @@ def covariance_of_twelve(result: Calibration) -> Float:
         unit[i, j] = unit[j, i] = 1.0
     parts = np.stack([(chain @ np.kron(B, unit) @ chain.T).ravel() for unit in units], axis=1)
     sizes = np.linalg.lstsq(parts, result.covariance.ravel())[0]
-    return np.kron(B, np.tensordot(sizes, units, axes=1))
+    twelve: Float = np.kron(B, np.tensordot(sizes, units, axes=1))
+    return twelve
 
 
 def _residuals(
