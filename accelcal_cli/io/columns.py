@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.reader import InputTable, Selection
+from accelcal_cli.io.row_filter import Condition, RowFilter
 
 Triple = tuple[int, int, int]
 Group = dict[str, tuple[list[int], list[int], list[int]]]
@@ -203,6 +204,24 @@ def choose_raw(
     if len(set(used)) < len(used):
         raise UsageError("--columns, --gyro, --time: a column is asked for twice")
     return replace(raw, gyro=turning, time=clock, dated=clock is not None and not table.numeric[clock])
+
+
+def restrict(table: InputTable, where: Sequence[str]) -> None:
+    """Let only those rows of a table be read that meet conditions, each as COLUMN=VALUE.
+
+    Raises:
+        UsageError: no condition, or no such column.
+    """
+    conditions = []
+    for text in where:
+        word, equals, value = text.partition("=")
+        if not (equals and word.strip() and value.strip()):
+            raise UsageError(f'--where "{text}": expected COLUMN=VALUE, as in device=0')
+        column = find_column(table, word.strip(), "--where")
+        name = str(column + 1) if table.names is None else table.names[column]
+        conditions.append(Condition(column, name, value.strip()))
+    if conditions:
+        table.filter = RowFilter(table.name, conditions)
 
 
 def sensor_column(table: InputTable, wanted: str | None = None) -> int:
