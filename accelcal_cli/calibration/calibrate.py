@@ -13,7 +13,7 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.sample import NEEDS, Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
@@ -112,6 +112,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
     fit = assessment.fit
     settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
     model = ErrorModel(fit.K[at], fit.D[at])
+    factor = float(fit.coverage[at])
     ratio, chance = (None if np.isnan(v) else v for v in fit.noise[:, at].tolist())
     return Calibration(
         K_a=model.K,
@@ -120,11 +121,13 @@ def record(assessment: Assessment, at: int) -> Calibration:
         f_0=model.f_0,
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
+        interval=NO_INTERVAL,
+        coverage_factor=None,
         dop=Dop.of(fit.dop[at]),
         verdict=assessment.verdicts[at],
         reasons=assessment.reasons[at],
         suggestions=assessment.suggestions[at],
-        cautions=assessment.cautions[at],
+        warnings=assessment.warnings[at],
         cost_search=float(search.cost[at]),
         cost=float(fit.value[at]),
         rms=float(fit.rms[at]),
@@ -132,13 +135,14 @@ def record(assessment: Assessment, at: int) -> Calibration:
         before=fit.before[at],
         s=float(fit.s[at]),
         freedom=int(fit.freedom[at]),
-        noise_ratio=ratio,
-        noise_chance=chance,
+        residual_noise_ratio=ratio,
+        residual_noise_p=chance,
         covariance=fit.covariance[at],
         information=fit.information[at],
         nominal_scale=np.array(fit.nominal[at]),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=int(fit.sample.poses[at]),
+        attitudes=fit.attitudes[at],
         evaluations=int(search.evaluations[at]),
         runs=search.runs,
         runs_agreeing=int(search.agreeing[at]),
@@ -152,7 +156,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         notes=_notes(assessment, at),
         version=__version__,
         temperature=fit.temperature,
-    )
+    ).with_intervals(factor)
 
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:
