@@ -10,7 +10,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
-from accelcal_cli.io.readings import LOOKED_AT, RAW_ROWS, Readings, may_be_doubtful
+from accelcal_cli.io.readings import Readings
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -95,13 +95,12 @@ class Sample:
     @classmethod
     def of_batch(cls, fleet: FleetReadings, batch: Batch) -> Sample:
         """Return the sample of a batch of a fleet."""
-        doubtful = may_be_doubtful(batch.output[:, :LOOKED_AT], batch.count) | (batch.count >= RAW_ROWS)
         return cls(
             poses=batch.count,
             lower=batch.output.min(axis=1),
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
-            doubtful=doubtful,
+            doubtful=fleet.doubtful(batch),
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
             scatter=batch.scatter,

@@ -141,7 +141,13 @@ class RowFilter:
         """Return which lines meet the conditions, None where polars may see other lines than are there."""
         import polars as pl
 
-        odd = b'"' in block or b"#" in block or dialect.separator == " " or b"\n\n" in block or b"\n\r\n" in block
+        odd = (
+            b'"' in block
+            or b"#" in block
+            or dialect.separator == " "
+            or b"\n\n" in block
+            or b"\n\r\n" in block
+        )
         if odd or block[:1] in b"\r\n" or not block.endswith(b"\n"):
             return None
         schema = {str(k): pl.String for k in range(dialect.width)}
@@ -164,4 +170,6 @@ class RowFilter:
 
     def _see(self, cells: pl.Series) -> None:
         if len(self._seen) <= SHOWN:
-            self._seen.update(dict.fromkeys(str(value) for value in cells.unique(maintain_order=True)[: SHOWN + 1]))
+            self._seen.update(
+                dict.fromkeys(str(value) for value in cells.unique(maintain_order=True)[: SHOWN + 1])
+            )

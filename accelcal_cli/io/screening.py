@@ -2,8 +2,7 @@
 
 `Screened` are the poses of one sensor, or the first `LOOKED_AT` of them; its `notices` name zeros, copies, dead and
 equal axes, clipping, gravity that is missing, a sensor that was never turned, two sensors in one table, and rows of a
-log. `needs_look` says cheaply which of R sensors to screen. `ZeroRows` leaves out the rows of an idle logger while a
-table is read. Raw logs are screened by detection/log_screening.py.
+log. `needs_look` says cheaply which of R sensors to screen. Raw logs are screened by detection/log_screening.py.
 
 Noise and resolution are measured on the readings themselves: `Surface` is the quadric nearest to all poses, and
 `grid_step` the step that all values are multiples of. A pattern is reported where noise and resolution together
@@ -13,6 +12,7 @@ would show it in fewer than `CHANCE` of honest sets.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,8 +21,8 @@ from typing import Self
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.io.reader import LineMap
-from accelcal_cli.notices import Notice
+from accelcal_cli.io.unusable_rows import SHOWN, named
+from accelcal_cli.notices import COMMAND, Notice
 
 LOOKED_AT = 4096
 """Poses that are looked at: the first."""
@@ -69,68 +69,7 @@ SCALE_SPREAD = 0.06
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of axes."""
 
-SHOWN = 6
-"""Poses that a sentence names at most."""
-
 Where = Callable[[int], str]
-
-
-class ZeroRows:
-    """Leaves out rows that are zero in all axes: idle sleep of a logger, or a bus that does not answer.
-
-    No pose reads so, unless the bias is 1 g; with known specific force, which may be none, they stay.
-
-    Attributes:
-        count: rows left out; first: their numbers, SHOWN at most.
-        rows: number of each row that stays.
-    """
-
-    def __init__(self) -> None:
-        """Start without rows."""
-        self.count, self.first = 0, list[int]()
-        self.rows = LineMap()
-        self._kept = 0
-
-    def keep(self, output: Float, start: int) -> Bool | None:
-        """Return which rows stay, shape (B,), or None for all; output (B, 3), `start` the number of the first."""
-        zero = output[:, 0] == 0.0
-        if zero.any():
-            zero &= (output[:, 1] == 0.0) & (output[:, 2] == 0.0)
-        keep = ~zero
-        if not zero.any():
-            self.rows.add(self._kept, start)
-            self._kept += len(output)
-            return None
-        gone = np.flatnonzero(zero)
-        self.count += len(gone)
-        self.first += (start + gone[: SHOWN - len(self.first)]).tolist()
-        place = self._kept + np.cumsum(keep) - keep
-        for row in np.flatnonzero(keep & np.append(True, zero[:-1])).tolist():
-            self.rows.add(int(place[row]), start + row)
-        self._kept += int(np.count_nonzero(keep))
-        return np.asarray(keep)
-
-    def notices(self, where: Where, left: int) -> tuple[Notice, ...]:
-        """Return what to say of them; `where` names a row, `left` rows have stayed."""
-        return zero_rows(self.count, left, _named([where(row) for row in self.first], self.count))
-
-
-def zero_rows(count: int, left: int, named: str = "") -> tuple[Notice, ...]:
-    """Return what is said of `count` rows of zeros that were left out, where `left` others stay."""
-    if not count:
-        return ()
-    text = f"{count:,} row{'s are' if count > 1 else ' is'} zero in all three axes"
-    text += f" ({named})" if named else ""
-    if count < left:
-        return (Notice("zero-rows", "note", f"{text}: no accelerometer at rest reads so; left out."),)
-    return (
-        Notice(
-            "zero-rows",
-            "warning",
-            f"{text} and were left out; only {left:,} others remain.",
-            "Record again with idle sleep mode off, and check that --columns names the accelerometer.",
-        ),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +90,7 @@ class Surface:
         if terms is None:
             return None
         x, half, poses = terms[:, 6:9], np.ptp(output, axis=0) / 2, len(output)
-        left, singular, right = np.linalg.svd(terms, full_matrices=False)
+        _, singular, right = np.linalg.svd(terms, full_matrices=False)
         a = right[-1]
         square = np.array([[2 * a[0], a[3], a[4]], [a[3], 2 * a[1], a[5]], [a[4], a[5], 2 * a[2]]])
         slope = math.sqrt(float(np.mean(np.sum((x @ square + a[6:9]) ** 2, axis=1))))
@@ -207,7 +146,7 @@ class Screened:
 
     Attributes:
         output: of the poses, LOOKED_AT at most, shape (J, 3), sensor units; names: of the three columns.
-        rows: how many poses there are in all; where: names a pose, from 0.
+        rows: how many poses there are in all; where: names a pose, from 0; source: of them, for a command.
         single: whether each row of a table is a pose; timed: whether the rows have times.
         count: readings behind each pose, shape (J,); scatter: standard deviation of one, shape (J, 3); or None.
     """
@@ -216,6 +155,7 @@ class Screened:
     names: Sequence[str]
     rows: int
     where: Where
+    source: str = "<array>"
     single: bool = True
     timed: bool = False
     count: Float | None = None
@@ -248,7 +188,7 @@ class Screened:
         step = np.maximum(self.steps, 1e-12 * np.abs(self.output).max(axis=0))
         noise = np.maximum(self.surface.noise, 1e-300)
         # The difference of two normal readings has a density of 1 / (2 sqrt(pi) sigma) at zero.
-        return np.minimum(1.0, step / (2 * math.sqrt(math.pi) * noise))
+        return np.asarray(np.minimum(1.0, step / (2 * math.sqrt(math.pi) * noise)))
 
     @cached_property
     def copies(self) -> int:
@@ -279,7 +219,9 @@ class Screened:
     def _one_point(self) -> Iterator[Notice]:
         if self.never_moved:
             text = f"The sensor was never turned: all {self.rows:,} readings lie within 3 degrees of one attitude."
-            yield Notice("never-moved", "warning", text, "Record poses that differ: accelcal plan names twelve.")
+            yield Notice(
+                "never-moved", "warning", text, "Record poses that differ: accelcal plan names twelve."
+            )
         else:
             text = (
                 "All poses are one point within their noise, so gravity is not in these columns "
@@ -294,15 +236,14 @@ class Screened:
         span = float(np.ptp(self.output, axis=0).max())
         if not (self.timed or np.median(steps) < ALIKE * span):
             return
-        text = (
-            f"Each row is taken for a pose at rest, but these {self.rows:,} rows are a log or repeat their poses."
-        )
-        moving = self.timed or _has_moves(steps, span)
+        text = f"Each row is taken for a pose at rest, and these {self.rows:,} rows are a log"
+        label = "of many readings of one pose, label the poses in a column."
+        if not (self.timed or _has_moves(steps, span)):
+            yield Notice("log", "note", f"{text} or repeat their poses; {label}")
+            return
+        place = {"<stdin>": "-", "<array>": "LOG"}.get(self.source, shlex.quote(self.source))
         yield Notice(
-            "log",
-            "warning" if moving else "note",
-            text,
-            "Calibrate with --raw; of many readings of one pose, label the poses in a column.",
+            "log", "warning", f"{text} with moves in it; {label}", f"{COMMAND}calibrate {place} --raw"
         )
 
     def _dead_axes(self) -> Iterator[Notice]:
@@ -310,7 +251,9 @@ class Screened:
         for i, name in enumerate(names):
             if (output[:, i] == output[0, i]).all():
                 text = f'Column "{name}" is {output[0, i]:g} in every pose: its axis is dead or was never turned.'
-                yield Notice("dead-axis", "warning", text, "Check the sensor, or name its columns with --columns.")
+                yield Notice(
+                    "dead-axis", "warning", text, "Check the sensor, or name its columns with --columns."
+                )
         for i, j in PAIRS:
             if (output[:, i] == output[:, j]).all() or (output[:, i] == -output[:, j]).all():
                 text = f'Columns "{names[i]}" and "{names[j]}" are equal in every pose: they show one axis.'
@@ -326,7 +269,9 @@ class Screened:
             text += " Sigma counts them as independent measurements."
             yield Notice("duplicate-rows", "warning", text, "Leave copies out.")
         elif copies >= MANY_COPIES * poses:
-            text += " The readings are quantized more coarsely than their noise, so repeating a pose adds little."
+            text += (
+                " The readings are quantized more coarsely than their noise, so repeating a pose adds little."
+            )
             yield Notice("duplicate-rows", "note", text, "Average many readings of each pose.")
 
     def _near_pairs(self) -> float:
@@ -345,12 +290,12 @@ class Screened:
         poses = sorted({pose for pose, _, _ in marks})
         sides = sorted({(axis, value) for _, axis, value in marks})
         ends = ", ".join(f'"{self.names[axis]}" at {value:.10g}' for axis, value in sides)
-        named = _named([self.where(pose) for pose in poses[:SHOWN]], len(poses))
+        places = named([self.where(pose) for pose in poses[:SHOWN]], len(poses))
         yield Notice(
             "clipped",
             "warning",
             f"Clipped readings, at the end of the range: column {ends}, in {len(poses)} of "
-            f"{len(self.output)} poses ({named}).",
+            f"{len(self.output)} poses ({places}).",
             "Set a wider range of the sensor and measure again, or leave these poses out.",
         )
 
@@ -371,8 +316,8 @@ class Screened:
                 yield self._frozen_notice(poses, f'column "{self.names[axis]}" repeats one value')
 
     def _frozen_notice(self, poses: Int, what: str) -> Notice:
-        named = _named([self.where(pose) for pose in poses[:SHOWN].tolist()], len(poses))
-        text = f"Frozen readings: {what} to the last digit in {len(poses)} poses ({named}), while others scatter."
+        places = named([self.where(pose) for pose in poses[:SHOWN].tolist()], len(poses))
+        text = f"Frozen readings: {what} to the last digit in {len(poses)} poses ({places}), while others scatter."
         return Notice("frozen", "warning", text, "Leave these poses out, or measure them again.")
 
     def _several(self) -> Iterator[Notice]:
@@ -381,9 +326,7 @@ class Screened:
         for part, words in ((order % 2 == 0, "every second row"), (order < poses // 2, "the second half")):
             if _fit_apart(self.output, part):
                 text = f"The poses fit two sensors, not one: {words} is another sensor, or it changed in between."
-                remedy = (
-                    "Give each sensor its own file, or a column that labels it (accelcal fleet, --where COLUMN=VALUE)."
-                )
+                remedy = "Give each sensor its own file, or a column that labels it (--where COLUMN=VALUE)."
                 yield Notice("several-sensors", "warning", text, remedy)
                 return
 
@@ -404,7 +347,9 @@ def _fit_apart(output: Float, part: Bool) -> bool:
     joint = _squares(terms)
     for half in (part, ~part):
         squares += _squares(terms[half])
-    return math.isfinite(squares + joint) and bool(_beyond_chance(np.array(joint), np.array(squares), freedom))
+    return math.isfinite(squares + joint) and bool(
+        _beyond_chance(np.array(joint), np.array(squares), freedom)
+    )
 
 
 def _beyond_chance(joint: Float, apart: Float, freedom: Int | int) -> Bool:
@@ -453,7 +398,7 @@ class Rails:
         groups: dict[float, list[tuple[int, float]]] = {}
         for axis in range(3):
             for value in (float(output[:, axis].min()), float(output[:, axis].max())):
-                size = abs(value) if _bits(value) is None else 2.0 ** (_bits(value) or 0)
+                size = abs(value) if bits_of_rail(value) is None else 2.0 ** (bits_of_rail(value) or 0)
                 groups.setdefault(size, []).append((axis, value))
         return list(groups.values())
 
@@ -465,7 +410,7 @@ class Rails:
         equal, near = _ties_elsewhere(output, tied, self.screened.surface)
         tie = max(float(self.screened.tie.max()) * near, equal, RARE)
         chance = 6 * tie ** (number - 1) if len(output) >= FEWEST else 1.0
-        bits = [_bits(value) for _, value, _ in tied]
+        bits = [bits_of_rail(value) for _, value, _ in tied]
         whole = bool((output == np.round(output)).all())
         if whole and bits[0] is not None and bits[0] >= 7 and np.abs(output).max() <= 2.0 ** bits[0]:
             hit = min(1.0, 1 / (SCALE_SPREAD * 2.0 ** bits[0]))
@@ -473,7 +418,7 @@ class Rails:
         return chance
 
 
-def _bits(value: float) -> int | None:
+def bits_of_rail(value: float) -> int | None:
     """Return n where a value is the end of a binary range, 2^n - 1 or -2^n."""
     size = value + 1 if value > 0 else -value
     mantissa, exponent = math.frexp(size)
@@ -511,7 +456,11 @@ def needs_look(output: Float, poses: Int) -> Bool:
     copies = (mixed[:, 1:] == mixed[:, :-1]).sum(axis=1)
     many = copies >= np.maximum(2, SOME_COPIES * np.minimum(poses, LOOKED_AT))
     return np.asarray(
-        np.logical_or.reduce(equal) | many | _at_ends(axes, real) | _is_odd(output, real) | (poses >= RAW_ROWS)
+        np.logical_or.reduce(equal)
+        | many
+        | _at_ends(axes, real)
+        | _is_odd(output, real)
+        | (poses >= RAW_ROWS)
     )
 
 
@@ -562,9 +511,3 @@ def _squares_of(terms: Float, part: Bool) -> Float:
     ridge = 1e-12 * np.trace(normal, axis1=1, axis2=2) + 1e-300
     solution = np.linalg.solve(normal + ridge[:, None, None] * np.eye(9), right[..., None])[..., 0]
     return np.asarray(np.maximum(part.sum(axis=1) - (right * solution).sum(axis=1), 0.0))
-
-
-def _named(shown: list[str], count: int) -> str:
-    """Return names in a list, and how many more there are."""
-    more = count - len(shown)
-    return ", ".join(shown) + (f" and {more:,} more" if more > 0 else "")
