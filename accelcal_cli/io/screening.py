@@ -33,9 +33,12 @@ CHANCE = 5e-4
 RAW_ROWS = 500
 """From so many rows on, rows with a time each, or each much like the one before, are a raw log rather than poses."""
 
-ALIKE, TRANSIT = 0.05, 0.2
-"""Most rows of a log differ from the one before by less than this part of the range. In a move the sensor passes
-through rows between two poses; poses without moves between them are apart by more than the second."""
+ALIKE = 0.05
+"""Most rows of a log differ from the one before by less than this part of the range."""
+
+BLOCK, CREEP, MOVING = 8, 6.0, 0.02
+"""Rows are in a move where means of BLOCK of them step by CREEP times what the quieter ones do; a log has MOVING of
+its rows in moves."""
 
 MANY_COPIES, SOME_COPIES = 1 / 3, 0.1
 """Parts of the poses from which on copies matter: where readings without noise may repeat, and where they cannot."""
@@ -238,7 +241,7 @@ class Screened:
             return
         text = f"Each row is taken for a pose at rest, and these {self.rows:,} rows are a log"
         label = "of many readings of one pose, label the poses in a column."
-        if not (self.timed or _has_moves(steps, span)):
+        if not (self.timed or _has_moves(self.output)):
             yield Notice("log", "note", f"{text} or repeat their poses; {label}")
             return
         place = {"<stdin>": "-", "<array>": "LOG"}.get(self.source, shlex.quote(self.source))
@@ -331,11 +334,17 @@ class Screened:
                 return
 
 
-def _has_moves(steps: Float, span: float) -> bool:
-    """Return whether rows pass through moves: steps above the noise that follow each other, shape (J - 1,)."""
-    moving = steps > np.maximum(6 * np.median(steps), 1e-3 * span)
-    small = moving & (steps < TRANSIT * span)
-    return bool((small[1:] & small[:-1]).sum() > 0.02 * len(steps))
+def _has_moves(output: Float) -> bool:
+    """Return whether rows, shape (J, 3), pass through moves: means of BLOCK rows that creep for three steps or more.
+
+    A jump from pose to pose, without rows between, is in two steps at most.
+    """
+    blocks = len(output) // BLOCK
+    means = output[: blocks * BLOCK].reshape(blocks, BLOCK, 3).mean(axis=1)
+    steps = np.abs(np.diff(means, axis=0)).max(axis=1)
+    span = float(np.ptp(output, axis=0).max())
+    moving = steps > max(CREEP * float(np.quantile(steps, 0.25)), 1e-3 * span)
+    return bool((moving[2:] & moving[1:-1] & moving[:-2]).mean() > MOVING)
 
 
 def _fit_apart(output: Float, part: Bool) -> bool:
@@ -412,7 +421,7 @@ class Rails:
         chance = 6 * tie ** (number - 1) if len(output) >= FEWEST else 1.0
         bits = [bits_of_rail(value) for _, value, _ in tied]
         whole = bool((output == np.round(output)).all())
-        if whole and bits[0] is not None and bits[0] >= 7 and np.abs(output).max() <= 2.0 ** bits[0]:
+        if whole and bits[0] is not None and output.min() >= -(2.0 ** bits[0]) and output.max() < 2.0 ** bits[0]:
             hit = min(1.0, 1 / (SCALE_SPREAD * 2.0 ** bits[0]))
             chance = min(chance, math.comb(6, sides) * hit**sides * min(1.0, tie) ** (number - sides))
         return chance
