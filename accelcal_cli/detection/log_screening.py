@@ -17,7 +17,7 @@ from typing import Self
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.detection.intervals import Intervals, StillLevel
+from accelcal_cli.detection.intervals import ROUNDING, Intervals, StillLevel
 from accelcal_cli.detection.windows import Tiles, Windows
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.screening import bits_of_rail
@@ -78,7 +78,7 @@ class Liveliness:
             still = np.linalg.norm(block[:, 3:6], axis=1) <= limit
             zero = (block[:, :6] == 0).all(axis=1)
             for i in range(3):
-                flat = (block[:, 3 + i] == 0) & ~zero & ~_at_rail(tiles, block[:, i], i)
+                flat = _is_flat(tiles, block, i) & ~zero
                 runs = _runs(flat)
                 long = np.zeros(len(block), dtype=bool)
                 for a, b in runs:
@@ -100,7 +100,7 @@ class Liveliness:
         def of(block: Float) -> Bool:
             bad = (block[:, :6] == 0).all(axis=1)
             for i in np.flatnonzero(self.axes).tolist():
-                bad |= (block[:, 3 + i] == 0) & ~_at_rail(tiles, block[:, i], i)
+                bad |= _is_flat(tiles, block, i)
             return np.asarray(bad)
 
         return of
@@ -128,7 +128,8 @@ class Liveliness:
         for side, (end, sign) in enumerate(((self.low, -1.0), (self.high, 1.0))):
             room = sign * (end - intervals.mean)
             at_rail = np.array([bits_of_rail(float(v)) is not None for v in end]) & (ends > 1) & (room == 0)
-            marks[..., side] = self.axes & (room <= reach * intervals.scatter) | at_rail
+            least = ROUNDING * np.abs(end)
+            marks[..., side] = self.axes & (room <= reach * intervals.scatter + least) | at_rail
         if not marks.any():
             return ()
         holds = np.flatnonzero(marks.any(axis=(1, 2)))
@@ -158,9 +159,11 @@ def _reach(rows: int) -> float:
     return min(1.0, max(0.0, NormalDist().inv_cdf(RARE ** (1 / max(rows, 2)))))
 
 
-def _at_rail(tiles: Tiles, mean: Float, axis: int) -> Bool:
-    """Return which tiles read an extreme of the log throughout: they are clipped, not frozen."""
-    return np.asarray((mean == tiles.low[axis]) | (mean == tiles.high[axis]))
+def _is_flat(tiles: Tiles, block: Float, axis: int) -> Bool:
+    """Return which tiles of a block read one value throughout, other than an extreme of the log: that is clipped."""
+    mean, off = block[:, axis], ROUNDING * np.abs(block[:, axis])
+    inside = (np.abs(mean - tiles.low[axis]) > off) & (np.abs(mean - tiles.high[axis]) > off)
+    return np.asarray((block[:, 3 + axis] <= tiles.size * off * off) & inside)
 
 
 def _runs(flags: Bool) -> list[tuple[int, int]]:
@@ -181,7 +184,7 @@ def check_gravity(
     mean = np.concatenate([w.mean for w in sample])
     variance = np.concatenate([w.variance for w in sample])
     broken = np.concatenate([w.broken for w in sample])
-    still = (variance <= STILLEST * level.quietest) & (variance > 0) & ~broken
+    still = (variance <= STILLEST * level.quietest) & ~broken
     if np.count_nonzero(still) < 2 or not level.extent:
         return
     spread = np.quantile(mean[still], [0.02, 0.98], axis=0)

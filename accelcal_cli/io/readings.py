@@ -214,6 +214,10 @@ class Collector:
         """Add one block."""
         rows = rows if self._all else self.zeros.without(rows)
         if not len(rows.numbers):
+            if self.zeros.count >= STUCK and not self.rows:
+                raise DataError(
+                    f"{self.source}: the first {self.zeros.count:,} readings are all equal, (0, 0, 0)"
+                )
             return
         output, extras = rows.numbers[:, :3], rows.numbers[:, 3:]
         self.rows += len(output)

@@ -421,7 +421,12 @@ class Rails:
         chance = 6 * tie ** (number - 1) if len(output) >= FEWEST else 1.0
         bits = [bits_of_rail(value) for _, value, _ in tied]
         whole = bool((output == np.round(output)).all())
-        if whole and bits[0] is not None and output.min() >= -(2.0 ** bits[0]) and output.max() < 2.0 ** bits[0]:
+        if (
+            whole
+            and bits[0] is not None
+            and output.min() >= -(2.0 ** bits[0])
+            and output.max() < 2.0 ** bits[0]
+        ):
             hit = min(1.0, 1 / (SCALE_SPREAD * 2.0 ** bits[0]))
             chance = min(chance, math.comb(6, sides) * hit**sides * min(1.0, tie) ** (number - sides))
         return chance

@@ -108,7 +108,9 @@ def two_sensors(tmp_path, header="device", values=("A 1", "B")):
 @pytest.mark.parametrize("header", ["device", "sensor_id", "I", "imu", "instance", "serial"])
 def test_several_sensors_are_refused_with_a_way_out(tmp_path, header):
     path = two_sensors(tmp_path, header)
-    with pytest.raises(DataError, match=rf'column "{header}" has 2 values \(A 1, B\).*--where .{header}=A 1.'):
+    with pytest.raises(
+        DataError, match=rf'column "{header}" has 2 values \(A 1, B\).*--where .{header}=A 1.'
+    ):
         read_readings(path)
     assert read_readings(path, where=[f"{header}=A 1"]).poses == 12
 

@@ -145,7 +145,9 @@ def test_readings_without_gravity_are_named(poses):
 
 
 def test_all_clipped_poses_are_named():
-    rows = np.clip(np.round(8192 * held(attitudes("turns", None), np.random.default_rng(3)) * 1.004), -8192, 8191)
+    rows = np.clip(
+        np.round(8192 * held(attitudes("turns", None), np.random.default_rng(3)) * 1.004), -8192, 8191
+    )
     rows = np.vstack([rows, [8191, 40, -300]])
     (notice,) = (n for n in Readings.from_array(rows).warnings if n.key == "clipped")
     marked = np.flatnonzero(((rows == 8191) | (rows == -8192)).any(axis=1))
@@ -163,7 +165,9 @@ def test_frozen_poses_are_told_by_their_scatter():
     assert keys(rows, scatter=scatter, count=count) == set()
     scatter[[3, 7]] = 0.0
     assert keys(rows, scatter=scatter, count=count) == {"frozen"}
-    coarse = np.where(rng.uniform(size=(24, 3)) < 0.4, 0.0, scatter)  # as of readings coarser than their noise
+    coarse = np.where(
+        rng.uniform(size=(24, 3)) < 0.4, 0.0, scatter
+    )  # as of readings coarser than their noise
     assert keys(rows, scatter=coarse, count=count) == set()
 
 
