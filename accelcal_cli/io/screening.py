@@ -46,6 +46,9 @@ MANY_COPIES, SOME_COPIES = 1 / 3, 0.1
 FEWEST = 12
 """Poses that show the noise: a quadric has nine parameters."""
 
+FIXED = 0.02
+"""Least singular value of the terms of a quadric over the greatest at which poses fix it."""
+
 FITTED = 1024
 """Poses at most that the quadric is fitted to."""
 
@@ -371,11 +374,15 @@ def _beyond_chance(joint: Float, apart: Float, freedom: Int | int) -> Bool:
 
 def _squares(terms: Float) -> float:
     """Return the sum of squares that the quadric leaves, inf where the poses do not fix it."""
-    left, target = terms[:, :9], terms[:, 9]
-    solution, _, _, singular = np.linalg.lstsq(left, target, rcond=None)
-    if len(left) < FEWEST or singular[-1] < 0.02 * singular[0]:
+    if len(terms) < FEWEST:
         return math.inf
-    return float(((left @ solution - target) ** 2).sum())
+    left, target = terms[:, :9], terms[:, 9]
+    # Normal equations: rounding is far below SMALLEST, and many poses cost little.
+    values, vectors = np.linalg.eigh(left.T @ left)
+    if values[0] < FIXED**2 * values[-1]:
+        return math.inf
+    parts = vectors.T @ (left.T @ target)
+    return max(float(target @ target - (parts**2 / values).sum()), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def test_forty_honest_logs_raise_no_alarm(capsys):
                 except DataError as fault:
                     alarms += [(noise, step, "refused")] * ("gravity" in str(fault) or "never" in str(fault))
     with capsys.disabled():
-        print(f"\nfalse alarms in raw logs: {len(alarms)} of {logs} {alarms}")
+        print(f"\nfalse alarms in raw logs: {len(alarms)} of {logs} {alarms}")  # noqa: T201
     assert not alarms
 
 
@@ -115,7 +115,7 @@ def test_turning_rates_in_place_of_acceleration():
 
 
 def test_a_sensor_that_was_never_turned():
-    rows = [0.1, 0.2, 9.8] + np.random.default_rng(1).normal(0, 0.02, (3000, 3))
+    rows = np.array([0.1, 0.2, 9.8]) + np.random.default_rng(1).normal(0, 0.02, (3000, 3))
     with pytest.raises(DataError, match="never turned: all readings show one attitude"):
         detected(rows)
 

@@ -71,7 +71,7 @@ def test_honest_readings_raise_no_alarm(capsys):
                         sets += 1
                         alarms += [(name, unit, mg, step, key) for key in keys(rows)]
     with capsys.disabled():
-        print(f"\nfalse alarms of the screening: {len(alarms)} in {sets} honest sets {alarms[:5]}")
+        print(f"\nfalse alarms of the screening: {len(alarms)} in {sets} honest sets {alarms[:5]}")  # noqa: T201
     assert len(alarms) <= 0.002 * sets + 1
 
 
@@ -133,7 +133,7 @@ def test_traps_are_named(trap, capsys):
                 named += key in keys(rows)
                 sets += 1
     with capsys.disabled():
-        print(f"\n{trap}: {key} named in {named} of {sets}")
+        print(f"\n{trap}: {key} named in {named} of {sets}")  # noqa: T201
     assert named >= 0.9 * sets
 
 

@@ -100,7 +100,7 @@ def test_rows_of_one_sensor_are_written_alone(run, tmp_path):
     assert run("calibrate", case, "--where", "device=0", "-o", "zero.yaml").code == 0
     assert run("apply", "zero.yaml", case, "--where", "device=0", "-o", "out.csv").code == 0
     lines = (tmp_path / "out.csv").read_text().splitlines()
-    source = [line for line in Path(case).read_text().splitlines() if not line.split(",")[1] == "1"]
+    source = [line for line in Path(case).read_text().splitlines() if line.split(",")[1] != "1"]
     assert [line.rsplit(",", 3)[0] for line in lines] == source
     force = np.array([line.split(",")[-3:] for line in lines[1:]], dtype=float)
     assert np.abs(np.linalg.norm(force, axis=1) - 9.80665).max() < 0.01
