@@ -110,9 +110,7 @@ def faults(sample: Sample, settings: Settings) -> list[str]:
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
     fit = assessment.fit
-    settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
-    model = ErrorModel(fit.K[at], fit.D[at])
-    factor = float(fit.coverage[at])
+    settings, search, model = fit.settings, fit.search, ErrorModel(fit.K[at], fit.D[at])
     ratio, chance = (None if np.isnan(v) else v for v in fit.noise[:, at].tolist())
     return Calibration(
         K_a=model.K,
@@ -122,7 +120,6 @@ def record(assessment: Assessment, at: int) -> Calibration:
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
         interval=NO_INTERVAL,
-        coverage_factor=None,
         dop=Dop.of(fit.dop[at]),
         verdict=assessment.verdicts[at],
         reasons=assessment.reasons[at],
@@ -152,11 +149,15 @@ def record(assessment: Assessment, at: int) -> Calibration:
         optimizer=search.optimizer,
         settings=_settings_record(assessment, at),
         g=settings.g,
-        data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
+        data=_origin(fit.sample.readings(at)),
         notes=_notes(assessment, at),
         version=__version__,
         temperature=fit.temperature,
-    ).with_intervals(factor)
+    ).with_intervals(float(fit.coverage[at]))
+
+
+def _origin(readings: Readings) -> dict[str, object]:
+    return {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
 
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -100,7 +101,6 @@ class Fit:
             shape (R,).
         covariance: of the nine parameters, (m/s^2)^2, shape (R, 9, 9), NaN where it does not hold.
         coverage: factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`.
-        attitudes: how many distinct ones the poses hold, R of them; None where they were not counted.
         at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
@@ -130,7 +130,6 @@ class Fit:
     s: Float
     covariance: Float
     coverage: Float
-    attitudes: list[int | None]
     at_wall: Bool
     rms: Float
     rms_before: Float
@@ -140,6 +139,11 @@ class Fit:
     noise: Float
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def attitudes(self) -> list[int | None]:
+        """How many distinct attitudes the poses hold, R of them; None where they were not counted."""
+        return count_attitudes(self.sample)
 
     @property
     def temperature(self) -> Temperature | None:
@@ -200,7 +204,6 @@ def fit(solution: Solution) -> Fit:
         s=np.sqrt(variance),
         covariance=covariance,
         coverage=coverage_of(freedom),
-        attitudes=count_attitudes(sample),
         at_wall=at_wall,
         rms=np.sqrt(sums[0] / sample.poses),
         rms_before=np.sqrt(sums[1] / sample.poses),

@@ -205,7 +205,6 @@ class Calibration:
     gauge: Gauge
     sigma: Sigma
     interval: Sigma
-    coverage_factor: float | None
     dop: Dop
     verdict: Verdict
     reasons: tuple[str, ...]
@@ -240,6 +239,7 @@ class Calibration:
     version: str
     schema: str = SCHEMA
     temperature: Temperature | None = None
+    coverage_factor: float | None = None
 
     @property
     def model(self) -> ErrorModel:

@@ -242,11 +242,15 @@ class Screened:
         span = float(np.ptp(self.output, axis=0).max())
         if not (self.timed or np.median(steps) < ALIKE * span):
             return
-        text = f"Each row is taken for a pose at rest, and these {self.rows:,} rows are a log"
         label = "of many readings of one pose, label the poses in a column."
         if not (self.timed or _has_moves(self.output)):
-            yield Notice("log", "note", f"{text} or repeat their poses; {label}")
+            text = f"Each row is taken for a pose at rest, and these {self.rows:,} rows are a log or repeat their poses"
+            yield Notice("log", "note", f"{text}; {label}")
             return
+        text = (
+            f"Each row is taken for a pose at rest. If these {self.rows:,} rows are a log with moves in it, its static "
+            f"poses have to be found first; {label}"
+        )
         place = {"<stdin>": "-", "<array>": "LOG"}.get(self.source, shlex.quote(self.source))
         yield Notice(
             "log", "warning", f"{text} with moves in it; {label}", f"{COMMAND}calibrate {place} --raw"
