@@ -222,12 +222,12 @@ def _parted(log: RawLog) -> tuple[Float, Float | None]:
 def _screened(tiles: Tiles, lengths: RowLengths, log: RawLog) -> tuple[StillLevel, Liveliness]:
     """Leave out what is frozen, and return what counts as still in the rest; DataError where no gravity turns."""
     sample = sample_windows(tiles, lengths, log.name)
-    level = find_level(sample, tiles, lengths, log.name)
+    level = find_level(tiles, lengths, log.name, sample)
     lively = Liveliness.of(tiles, level)
     tiles.unusable = lively.unusable(tiles)
     if lively.frozen:
         sample = sample_windows(tiles, lengths, log.name)
-        level = find_level(sample, tiles, lengths, log.name)
+        level = find_level(tiles, lengths, log.name, sample)
     check_gravity(sample, level, log.name, log.columns.names, log.gyro_names())
     return level, lively
 

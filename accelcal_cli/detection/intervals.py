@@ -155,16 +155,19 @@ def sample_windows(tiles: Tiles, lengths: RowLengths, name: str) -> list[Windows
     return list(windows(tiles, lengths.width, -(-count // SAMPLE)))
 
 
-def find_level(sample: Sequence[Windows], tiles: Tiles, lengths: RowLengths, name: str) -> StillLevel:
+def find_level(
+    tiles: Tiles, lengths: RowLengths, name: str, sample: Sequence[Windows] | None = None
+) -> StillLevel:
     """Return what counts as still.
 
     Args:
-        sample: windows of the log; tiles: the log; name: of it, for messages.
+        tiles: the log; name: of it, for messages; sample: its `sample_windows`, if there already.
         lengths: of window, still period and least interval.
 
     Raises:
         DataError: a log without any noise, a stated still period that is not still.
     """
+    sample = sample_windows(tiles, lengths, name) if sample is None else sample
     mean, variance = np.concatenate([w.mean for w in sample]), np.concatenate([w.variance for w in sample])
     noisy = variance > (ROUNDING * float(np.abs(mean).max())) ** 2
     if not noisy.any():

@@ -20,8 +20,8 @@ from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.detection.intervals import ROUNDING, Intervals, StillLevel
 from accelcal_cli.detection.windows import Tiles, Windows
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.rows import SHOWN, named
 from accelcal_cli.io.screening import bits_of_rail
-from accelcal_cli.io.unusable_rows import SHOWN, named
 from accelcal_cli.notices import Notice
 
 LONG = 5
@@ -141,7 +141,7 @@ class Liveliness:
         ]
         shown = named([intervals.where(k) for k in holds[:SHOWN].tolist()], len(holds))
         text = (
-            f"Clipped readings, at the end of the range: column {', '.join(columns)}, in {len(holds)} of "
+            f"Clipped readings: column {', '.join(columns)}, an end of the range, in {len(holds)} of "
             f"{len(intervals)} poses ({shown})."
         )
         return (

@@ -21,7 +21,7 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import RawColumns, choose_raw, restrict
 from accelcal_cli.io.reader import InputTable, RowBlock, open_table, shorten
-from accelcal_cli.io.unusable_rows import OneSensor, ZeroRows
+from accelcal_cli.io.rows import OneSensor, ZeroRows
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""

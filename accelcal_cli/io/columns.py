@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.reader import InputTable, Selection
-from accelcal_cli.io.row_filter import Condition, RowFilter
 
 Triple = tuple[int, int, int]
 Group = dict[str, tuple[list[int], list[int], list[int]]]
@@ -221,6 +220,10 @@ def restrict(table: InputTable, where: Sequence[str]) -> None:
     Raises:
         UsageError: no condition, or no such column.
     """
+    if not where:
+        return
+    from accelcal_cli.io.rows import Condition, RowFilter  # which itself knows columns
+
     conditions = []
     for text in where:
         word, equals, value = text.partition("=")
@@ -229,8 +232,7 @@ def restrict(table: InputTable, where: Sequence[str]) -> None:
         column = find_column(table, word.strip(), "--where")
         name = str(column + 1) if table.names is None else table.names[column]
         conditions.append(Condition(column, name, value.strip()))
-    if conditions:
-        table.filter = RowFilter(table.name, conditions)
+    table.filter = RowFilter(table.name, conditions)
 
 
 def sensor_column(table: InputTable, wanted: str | None = None) -> int:

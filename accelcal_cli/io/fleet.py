@@ -20,9 +20,9 @@ from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import InputTable, RowBlock, open_table
 from accelcal_cli.io.readings import LabelledMeans, Readings, check_rows, number_labels
+from accelcal_cli.io.rows import ZeroRows, add_stretches, places, zero_rows
 from accelcal_cli.io.screening import LOOKED_AT, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
-from accelcal_cli.io.unusable_rows import ZeroRows, add_stretches, places, zero_rows
 from accelcal_cli.notices import Notice
 
 SLAB = 2_000_000

@@ -15,7 +15,7 @@ import polars as pl
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
-from accelcal_cli.io.row_filter import RowFilter
+from accelcal_cli.io.rows import RowFilter
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
 
 ROWS = 500_000

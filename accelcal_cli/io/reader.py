@@ -26,7 +26,7 @@ from accelcal_cli.io.stream import ByteSource, open_source
 if TYPE_CHECKING:
     import polars as pl
 
-    from accelcal_cli.io.row_filter import RowFilter
+    from accelcal_cli.io.rows import RowFilter
 
 LIMIT = 1e100
 """Largest reading: greater values cannot be squared safely."""

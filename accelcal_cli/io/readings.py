@@ -20,9 +20,9 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, choose, restrict
 from accelcal_cli.io.reader import LIMIT, InputTable, RowBlock, open_table
+from accelcal_cli.io.rows import OneSensor, ZeroRows
 from accelcal_cli.io.screening import LOOKED_AT, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
-from accelcal_cli.io.unusable_rows import OneSensor, ZeroRows
 from accelcal_cli.notices import Notice
 
 STUCK = 1_000_000
@@ -117,7 +117,7 @@ class Readings:
         spread = None if spread is None else spread[kept]
         sha256 = hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest()
         return replace(
-            collector.readings(sha256, known=(numbers, spread), warnings=warnings),
+            collector.readings(sha256, known=(numbers, spread), warm=warm is not None, warnings=warnings),
             labels=None if labels is None else tuple(np.array(labels, dtype=str)[kept].tolist()),
             count=numbers,
             scatter=spread,
@@ -243,6 +243,7 @@ class Collector:
         where: Callable[[int], str] | None = None,
         *,
         known: tuple[Float | None, Float | None] = (None, None),
+        warm: bool = False,
         warnings: tuple[Notice, ...] | None = None,
     ) -> Readings:
         """Return the poses of all rows; DataError where they are too few or all the same.
@@ -250,6 +251,7 @@ class Collector:
         Args:
             sha256: of the input; where: how to name a row (from 0) to the user.
             known: readings behind each pose (J,) and their scatter (J, 3), where no column has them.
+            warm: whether temperatures are known, likewise.
             warnings: what is said of them; None to screen them.
         """
         columns, means = self.columns, self._means
@@ -279,7 +281,9 @@ class Collector:
             _line=line,
         )
         if warnings is None:
-            found = self._screened(readings, known).notices()
+            found = replace(
+                self._screened(readings, known), warm=warm or columns.temperature is not None
+            ).notices()
             warnings = (*found, *self.zeros.notices(where or _pose, self.store.rows))
         return replace(readings, warnings=warnings)
 

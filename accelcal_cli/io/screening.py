@@ -21,7 +21,7 @@ from typing import Self
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.io.unusable_rows import SHOWN, named
+from accelcal_cli.io.rows import SHOWN, named
 from accelcal_cli.notices import COMMAND, Notice
 
 LOOKED_AT = 4096
@@ -154,6 +154,7 @@ class Screened:
         output: of the poses, LOOKED_AT at most, shape (J, 3), sensor units; names: of the three columns.
         rows: how many poses there are in all; where: names a pose, from 0; source: of them, for a command.
         single: whether each row of a table is a pose; timed: whether the rows have times.
+        warm: whether they have temperatures, with which one sensor may drift from the first half to the second.
         count: readings behind each pose, shape (J,); scatter: standard deviation of one, shape (J, 3); or None.
     """
 
@@ -164,16 +165,18 @@ class Screened:
     source: str = "<array>"
     single: bool = True
     timed: bool = False
+    warm: bool = False
     count: Float | None = None
     scatter: Float | None = None
 
     def notices(self) -> tuple[Notice, ...]:
         """Return what the readings show, warnings first."""
-        if self.never_moved or self.gravity_removed:
-            found = [*self._one_point()]
-        else:
-            checks = (self._log, self._dead_axes, self._several, self._copies, self._clipped, self._frozen)
-            found = [notice for check in checks for notice in check()]
+        dead = list(self._dead_axes())
+        if not dead and (self.never_moved or self.gravity_removed):
+            return tuple(self._one_point())
+        found = [*self._log(), *dead, *self._copies()]
+        if not dead:
+            found += [*self._several(), *self._clipped(), *self._frozen()]
         return tuple(sorted(found, key=lambda notice: notice.severity != "warning"))
 
     @cached_property
@@ -275,7 +278,7 @@ class Screened:
             return
         text = f"{copies:,} of {poses:,} poses repeat another to the last digit."
         expected = float(np.prod(self.tie)) * self._near_pairs()
-        if copies > 3 + 5 * expected or (copies >= MANY_COPIES * poses and not (self.steps > 0).all()):
+        if copies > 2 + 5 * expected or (copies >= MANY_COPIES * poses and not (self.steps > 0).all()):
             text += " Sigma counts them as independent measurements."
             yield Notice("duplicate-rows", "warning", text, "Leave copies out.")
         elif copies >= MANY_COPIES * poses:
@@ -304,7 +307,7 @@ class Screened:
         yield Notice(
             "clipped",
             "warning",
-            f"Clipped readings, at the end of the range: column {ends}, in {len(poses)} of "
+            f"Clipped readings: column {ends}, an end of the range, in {len(poses)} of "
             f"{len(self.output)} poses ({places}).",
             "Set a wider range of the sensor and measure again, or leave these poses out.",
         )
@@ -332,6 +335,8 @@ class Screened:
 
     def _several(self) -> Iterator[Notice]:
         poses = len(self.output)
+        if self.warm:
+            return
         order = np.arange(poses)
         for part, words in ((order % 2 == 0, "every second row"), (order < poses // 2, "the second half")):
             if _fit_apart(self.output, part):
@@ -349,6 +354,8 @@ def _has_moves(output: Float) -> bool:
     blocks = len(output) // BLOCK
     means = output[: blocks * BLOCK].reshape(blocks, BLOCK, 3).mean(axis=1)
     steps = np.abs(np.diff(means, axis=0)).max(axis=1)
+    if np.median(steps) > np.median(np.abs(np.diff(output, axis=0)).max(axis=1)):
+        return True  # it moves all the time: means of noise would differ by less than rows do
     span = float(np.ptp(output, axis=0).max())
     moving = steps > max(CREEP * float(np.quantile(steps, 0.25)), 1e-3 * span)
     return bool((moving[2:] & moving[1:-1] & moving[:-2]).mean() > MOVING)
