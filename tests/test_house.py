@@ -18,8 +18,8 @@ FILES, LINES = 136, 600
 
 FLOW = {
     "calibrate": (42, 76),  # files and pairs of files; 61 and 101 in the first version
-    "detect": (39, 59),  # 58 and 89
-    "fleet": (38, 58),  # 56 and 69
+    "detect": (38, 59),  # 58 and 89
+    "fleet": (37, 58),  # 56 and 69
     "benchmark": (28, 64),  # 59 and 64
 }
 RETURNS = 65

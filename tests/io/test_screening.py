@@ -58,7 +58,7 @@ def quantized(rows, unit, step):
 
 
 def test_honest_readings_raise_no_alarm(capsys):
-    """At most 0.2 % of false alarms is wanted: 1 680 sets, so 3 at most; none is measured."""
+    """At most 0.2 % of false alarms is wanted; one more is allowed for chance, in 840 sets."""
     rng, alarms, sets = np.random.default_rng(11), [], 0
     names = ("edges", "faces-edges", "turns", "fibonacci", "icosahedron", "random", "cap")
     for name in names:
