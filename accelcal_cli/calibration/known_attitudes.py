@@ -207,8 +207,7 @@ def covariance_of_twelve(result: Calibration) -> Float:
         unit[i, j] = unit[j, i] = 1.0
     parts = np.stack([(chain @ np.kron(B, unit) @ chain.T).ravel() for unit in units], axis=1)
     sizes = np.linalg.lstsq(parts, result.covariance.ravel())[0]
-    twelve: Float = np.kron(B, np.tensordot(sizes, units, axes=1))
-    return twelve
+    return np.asarray(np.kron(B, np.tensordot(sizes, units, axes=1)), dtype=float)
 
 
 def _residuals(

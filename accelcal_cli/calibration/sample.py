@@ -10,7 +10,8 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
-from accelcal_cli.io.readings import LOOKED_AT, Readings
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.screening import LOOKED_AT
 from accelcal_cli.sensor.poses import axis_up
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ class Sample:
     @classmethod
     def of_batch(cls, fleet: FleetReadings, batch: Batch) -> Sample:
         """Return the sample of a batch of a fleet."""
-        doubtful = batch.doubtful
+        doubtful = fleet.doubtful(batch)
         if _name_up(fleet.where, batch.pose[:1].ravel().tolist()):  # one table, one kind of labels
             doubtful = np.ones_like(doubtful)
         return cls(

@@ -105,6 +105,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
+    where: options.Where = None,
     gravity: options.GravityOptions,
     config: Annotated[
         Path | None, options.in_input(help="YAML file: optimizer, its parameters, box, gauge, ...")
@@ -150,9 +151,11 @@ def command(
     if raw:
         if log.min_poses is None and not settings.misalignment:
             log = replace(log, min_poses=FACES)
-        readings = log.detect(data, columns, settings.g).readings()
+        readings = log.detect(data, columns, where, settings.g).readings()
     else:
-        readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+        readings = read_readings(
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()
+        )
     result = calibrate(readings, settings)
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():

@@ -158,6 +158,12 @@ Columns = Annotated[
     str | None,
     in_input("--columns", help="The three output columns: names, or numbers from 1, separated by commas."),
 ]
+Where = Annotated[
+    list[str] | None,
+    in_input(
+        "--where", help="Read only rows with this value, as device=0; repeatable.", metavar="COLUMN=VALUE"
+    ),
+]
 Force = Annotated[bool, in_input("--force", help="Use a result although its verdict is undetermined.")]
 Format = Annotated[
     str,
@@ -276,12 +282,14 @@ class DetectionOptions:
         in_log(help="Attitudes, 5 degrees apart, that must be found.", show_default="12", min=2),
     ] = None
 
-    def detect(self, data: str, columns: str | None, g: float, picture: bool = False) -> Detection:
+    def detect(
+        self, data: str, columns: str | None, where: list[str] | None, g: float, picture: bool = False
+    ) -> Detection:
         """Find the static poses of a raw log.
 
         Args:
             data: file, or - for standard input.
-            columns: option --columns.
+            columns: option --columns; where: options --where.
             g: local gravity, m/s^2.
             picture: keep what a picture of the log needs.
         """
@@ -291,7 +299,12 @@ class DetectionOptions:
         check_input(data)
         settings = self._settings(g)
         log = open_raw_log(
-            data, split_columns(columns), split_columns(self.gyro), self.time, stdin=sys.stdin.buffer
+            data,
+            split_columns(columns),
+            split_columns(self.gyro),
+            self.time,
+            stdin=sys.stdin.buffer,
+            where=where or (),
         )
         try:
             return detect(log, settings, picture)

@@ -23,6 +23,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
+    where: options.Where = None,
     g: Annotated[
         float | None,
         options.in_input(help="Local gravity; must be that of the result.", show_default="the result's"),
@@ -56,7 +57,7 @@ def command(
         raise UsageError(
             f"--g {g:g}: {result} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
         )
-    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ())
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():
         options.print_result(

@@ -175,7 +175,8 @@ def test_a_reference_that_points_down_is_told():
             lambda rows: rows.__setitem__(slice(8), rows[16:]),
             "8 of 24 poses repeat another to the last digit",
         ),
-        (lambda rows: rows.__setitem__(slice(7), rows[17:]), None),
+        (lambda rows: rows.__setitem__(slice(3), rows[21:]), "3 of 24 poses repeat another"),
+        (lambda rows: rows.__setitem__(slice(2), rows[22:]), None),
     ],
 )
 def test_dead_and_doubled_axes_and_copies_are_told(spoil, words):
