@@ -171,6 +171,7 @@ def _outliers(fit: Fit) -> list[tuple[int, ...]]:
     if fit.solution is None or fit.settings.robust != "none":
         return outliers
     bent = (fit.s > LARGE * fit.settings.g) | (outlier.sum(axis=1) > 1) | fit.at_wall.any(axis=1)
+    bent &= np.array([word != "undetermined" for word in fit.geometry.observability.verdicts])
     for at in np.flatnonzero(bent).tolist():
         agreement = consensus(fit.sample.take(np.array([at])), fit.settings)
         if agreement is not None and not agreement.agreeing.all():
