@@ -48,6 +48,9 @@ NEVER = 0.03
 ALTERNATE, CYCLE = 0.4, 4
 """Rows alternate between up to CYCLE sensors where each is nearer by this factor to the one a cycle before."""
 
+IN_STEP = (3, 5, 7, 11, 13)
+"""Cycles after which sensors in turn are still in step."""
+
 RARE = 1e-6
 """Chance that no reading of an honest hold is further from the mean than the end of the range."""
 
@@ -225,6 +228,10 @@ def alternating(rows: Float, time: Float | None) -> tuple[Notice, ...]:
     steps = [float(np.median(np.abs(rows[k:] - rows[:-k]), axis=0).sum()) for k in range(1, CYCLE + 1)]
     number = next((k for k in range(2, CYCLE + 1) if steps[k - 1] < ALTERNATE * min(steps[: k - 1])), 0)
     if not number:
+        return ()
+    # A vibration falls out of step with any number of rows; sensors in turn never do.
+    later = [np.abs(rows[m * number :] - rows[: -m * number]) for m in IN_STEP]
+    if max(float(np.median(part, axis=0).sum()) for part in later) > ALTERNATE * min(steps[: number - 1]):
         return ()
     stamps = (
         "" if time is None or np.count_nonzero(np.diff(time) == 0) < 0.4 * len(time) else ", with equal times"

@@ -278,7 +278,7 @@ class Screened:
             return
         text = f"{copies:,} of {poses:,} poses repeat another to the last digit."
         expected = float(np.prod(self.tie)) * self._near_pairs()
-        if copies > 2 + 5 * expected or (copies >= MANY_COPIES * poses and not (self.steps > 0).all()):
+        if copies > 3 + 5 * expected or (copies >= MANY_COPIES * poses and not (self.steps > 0).all()):
             text += " Sigma counts them as independent measurements."
             yield Notice("duplicate-rows", "warning", text, "Leave copies out.")
         elif copies >= MANY_COPIES * poses:

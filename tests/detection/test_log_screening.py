@@ -138,3 +138,10 @@ def test_sensors_in_turn(log):
     assert alternating(numbers, None) == ()
     times = np.repeat(np.arange(len(numbers)), 2)
     assert "equal times" in alternating(rows, times)[0].text
+
+
+@pytest.mark.parametrize("rate", [23.3, 33.7, 45.0, 48.5])
+def test_a_vibration_is_not_several_sensors(rate):
+    numbers, _ = simulated(14, seed=6, gyro=False, timed=False)
+    waves = 5000 * np.sin(2 * np.pi * rate * np.arange(len(numbers))[:, None] / 100 + [0.0, 1.0, 2.0])
+    assert alternating(numbers + waves, None) == ()
