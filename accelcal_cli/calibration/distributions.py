@@ -205,7 +205,7 @@ def _beta_fraction(a: Float, b: Float, x: Float) -> Float:
     c = np.ones_like(x)
     d = 1.0 - (a + b) * x / (a + 1.0)
     d = 1.0 / np.where(np.abs(d) < SMALLEST, SMALLEST, d)
-    h = d
+    h, going = d, np.ones(x.shape, dtype=bool)
     for m in range(1, FRACTIONS):
         for term in (
             m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
@@ -215,9 +215,10 @@ def _beta_fraction(a: Float, b: Float, x: Float) -> Float:
             d = 1.0 / np.where(np.abs(d) < SMALLEST, SMALLEST, d)
             c = 1.0 + term / c
             c = np.where(np.abs(c) < SMALLEST, SMALLEST, c)
-            step = c * d
+            step = np.where(going, c * d, 1.0)  # each comes to the same value in any company
             h = h * step
-        if (np.abs(step - 1.0) < 1e-15).all():
+        going = np.abs(step - 1.0) >= 1e-15
+        if not going.any():
             break
     return np.asarray(front * h)
 

@@ -33,8 +33,8 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, length_error, pose_residuals, worst
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.sample import Sample, loss_slope, loss_weight
-from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution
+from accelcal_cli.calibration.sample import NO_NOISE, Sample, loss_slope, loss_weight
+from accelcal_cli.calibration.search import SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.weights import directions
 from accelcal_cli.sensor.model import Gauge, to_gauge
@@ -241,6 +241,8 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     sigma = np.sqrt(variance[:, None] * np.einsum("rpp->rp", cofactor))
     with np.errstate(divide="ignore", invalid="ignore"):
         notable = (np.abs(bias) > NOTABLE_BIAS * sigma).any(axis=1) & (np.abs(bias) < 0.1 * g).all(axis=1)
+        notable &= variance > (NO_NOISE * g) ** 2
+        notable &= ~_at_wall(solution.x).any(axis=1)
     if not notable.any():
         return point
     taken = np.where(notable[:, None], bias, 0.0)
@@ -333,7 +335,9 @@ def _geometry(
         attitudes = np.where(sample.labelled, sample.poses, attitudes)
     loss = None if slopes is None else slopes.loss * (attitudes / sample.poses)[:, None, None]
     once = once if loss is None else once - loss
-    alike = (attitudes == sample.poses) & (solution.stated.weights is None)
+    alike = attitudes == sample.poses
+    if solution.stated.settings.weights != "none" or solution.stated.rejected is not None:
+        alike = np.zeros_like(alike)
     return Geometry.of(np.where(alike[:, None, None], information, once), attitudes, held)
 
 

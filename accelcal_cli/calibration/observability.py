@@ -244,7 +244,7 @@ def poses_to_add(information: Float, poses: int, *, aligned: bool) -> tuple[str,
     """
     candidates = faces() if aligned else fixture_directions()
     known = knowing(information, ALIGNED) if aligned else information
-    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
+    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES + 1 - poses)
     return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
 
 

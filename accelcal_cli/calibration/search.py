@@ -17,7 +17,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.consensus import consensus
 from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.sample import NO_NOISE, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.calibration.weights import (
@@ -35,10 +35,6 @@ SAME_MINIMUM = 1e-6
 
 ROUNDING = 1e-26
 """A cost per reading, in units of g^4, below which only rounding is left."""
-
-NO_NOISE = 1e-9
-"""Residuals, or their standard deviation, below this part of g are rounding: readings are seldom written with ten
-digits, and no accelerometer is as quiet."""
 
 REWEIGHTINGS, SETTLED = 50, 1e-9
 """Robust rounds at most, about ten are the rule; and the step, in half-widths of the box, that ends them."""
