@@ -21,6 +21,7 @@ from accelcal_cli.calibration.sample import NO_NOISE, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.calibration.weights import (
+    MOST_TREMOR,
     SURELY_TREMBLES,
     PoseNoise,
     Tremor,
@@ -200,6 +201,10 @@ def _with_noise(stated: Stated) -> Stated:
     sample, g = stated.sample, stated.settings.g
     K, D = first_sensors(stated.cost)
     trembling = tremor(sample, K, D, g)
+    if trembling is not None:
+        # Directions by a sphere, where the poses fix no ellipsoid, do not tell along from across.
+        poor = np.array([source == "sphere" for source in stated.sources]) | (trembling.angle > MOST_TREMOR)
+        trembling = replace(trembling, certainty=np.where(poor, 0.0, trembling.certainty))
     if trembling is not None and (trembling.certainty > SURELY_TREMBLES).any():
         shakes = (trembling.certainty > SURELY_TREMBLES)[:, None]
         longer = directions(sample, K, D) * np.where(shakes, trembling.excess / g, 0.0)[..., None]

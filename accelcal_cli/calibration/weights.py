@@ -26,6 +26,9 @@ SMALLEST_RATIO = 0.01
 MOST_PRIOR = 1e6
 """Degrees of freedom of the pooled covariance in a pose from which on the poses are alike."""
 
+MOST_TREMOR = 0.3
+"""Tremor, rad rms, beyond which a sensor is turned rather than held."""
+
 SURELY_TREMBLES = 4.0
 """Standard deviations of the tangential excess beyond which a hand trembles: by chance 1 in 30 000."""
 
