@@ -33,10 +33,10 @@ MOST_TERMS = 2000
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it (0: not known)."""
+    """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it, whole or not (0: not known)."""
 
     variance: float
-    freedom: int
+    freedom: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +252,26 @@ def student_quantile(probability: float, freedom: float) -> float:
         if abs(step) <= 1e-13 * angle:
             break
     return math.sqrt(freedom) * math.tan(angle)
+
+
+MOST_STUDENT = 1e9
+"""Degrees of freedom from which on Student's t is the normal distribution to nine digits."""
+
+
+def student_freedom(probability: float, value: float) -> float:
+    """Return the degrees of freedom with which Student's t stays below a value with a probability.
+
+    The inverse of `student_quantile` in its other argument: at least 1, at most MOST_STUDENT.
+
+    Args:
+        probability: above 0.5; value: above the quantile of the normal distribution.
+    """
+    low, high = 0.0, math.log(MOST_STUDENT)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = student_quantile(probability, math.exp(middle)) > value
+        low, high = (middle, high) if above else (low, middle)
+    return math.exp(0.5 * (low + high))
 
 
 def _cosine_power(angle: Float, power: float) -> Float:

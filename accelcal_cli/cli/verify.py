@@ -45,7 +45,7 @@ def command(
     that --tolerance was missed.
     """
     from accelcal_cli.io.readings import read_readings
-    from accelcal_cli.verification import verify
+    from accelcal_cli.verification.verify import verify
     from accelcal_cli.views.verification import blocks, differences
 
     options.check_input(data)

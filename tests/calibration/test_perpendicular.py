@@ -20,7 +20,7 @@ from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.planning import plan
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.verification import verify
+from accelcal_cli.verification.verify import verify
 from accelcal_cli.views.calibration import tables
 from accelcal_cli.views.plan import pose_table
 

@@ -16,7 +16,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.verification import verify
+from accelcal_cli.verification.verify import verify
 from accelcal_cli.views.verification import differences, evidence
 
 G, SIGMA = 9.8, 2e-3
@@ -175,7 +175,7 @@ def test_a_pose_that_is_wrong_is_named(u):
     assert found.verdict == "inconclusive"
     assert (
         str(found.warnings[-1])
-        == "Outlier: pose 4 does not fit the other poses (p < 0.01). Measure it again."
+        == "Outlier: pose 4 does not fit the other poses (p < 0.002). Measure it again."
     )
 
 
@@ -185,7 +185,7 @@ def test_a_pose_that_is_a_little_wrong_is_named_beside_the_verdict():
     found = verify(result(), Readings.from_array(output, labels=[f"p{k}" for k in range(24)]))
     assert found.verdict == "unchanged"
     assert [str(notice) for notice in found.warnings] == [
-        'Outlier: position "p3" does not fit the other poses (p < 0.01). Measure it again.',
+        'Outlier: position "p3" does not fit the other poses (p < 0.002). Measure it again.',
     ]
     assert verify(result(), new()).warnings == ()
 
@@ -303,8 +303,8 @@ def test_an_axis_that_died_is_a_matter_of_the_sensor():
 
 
 def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
-    monkeypatch.setattr("accelcal_cli.verification.check_unit", lambda *_: None)
-    monkeypatch.setattr("accelcal_cli.verification.limitations_of", lambda *_: ())
+    monkeypatch.setattr("accelcal_cli.verification.verify.check_unit", lambda *_: None)
+    monkeypatch.setattr("accelcal_cli.verification.verify.limitations_of", lambda *_: ())
     plain = ErrorModel(1670.0 * np.eye(3), np.zeros(3))
     old = calibrate(readings(TURNS, model=plain, sigma=SIGMA, seed=1), FAST)
     found = verify(old, Readings.from_array(new(poses.faces()[:2], model=plain).output() / 1e4))
