@@ -151,7 +151,9 @@ def whole(case: Case, pairs: int) -> tuple[float, float]:
 def verdict(case: Case, number: int) -> str:
     """Return the verdict on one sensor."""
     random = np.random.default_rng([number, 20])
-    K = np.eye(3) + (np.diag(0.01 * random.normal(size=3)) if case.aligned else 0.01 * random.normal(size=(3, 3)))
+    K = np.eye(3) + (
+        np.diag(0.01 * random.normal(size=3)) if case.aligned else 0.01 * random.normal(size=(3, 3))
+    )
     D = 0.2 * random.normal(size=3)
     later = K @ np.linalg.qr(random.normal(size=(3, 3)))[0] if case.turned else K.copy()
     later[2] *= 1.0 + case.scale
@@ -180,7 +182,11 @@ def drawn(case: Case, sensor: ErrorModel, u: Float, degrees: Float, random: np.r
     if case.degrees is None:
         return Readings.from_array(output, count=count, scatter=scatter, cross=cross)
     t = (degrees - 30.0)[:, None]
-    output = (output - sensor.D) * (1.0 + 0.1 * DRIFT * t * [1.0, -0.5, 0.8]) + sensor.D + DRIFT * t * [1.0, -1.0, 0.5]
+    output = (
+        (output - sensor.D) * (1.0 + 0.1 * DRIFT * t * [1.0, -0.5, 0.8])
+        + sensor.D
+        + DRIFT * t * [1.0, -1.0, 0.5]
+    )
     return Readings.from_array(output, count=count, scatter=scatter, cross=cross, temperature=degrees)
 
 

@@ -271,13 +271,13 @@ class _View:
         # Where nothing is shared the scatter may overstate the noise.
         ratio = 1.0 if old.residual_noise_ratio is None else min(old.residual_noise_ratio, 1.0)
         part = ratio**2 if old.shared_noise == 0 else 1.0
-        variance = old.shared_noise**2 + part * noise.variance
+        own: Float = old.shared_noise**2 + part * noise.variance
         w, rows = self.weights(), design(self.u)
         room = 1.0 - leverages(rows, w, self.cofactor[None])
         if _counted(self.stated) <= self.basis.shape[1]:
             room = np.ones_like(w)
-        expected = float(np.sum(w * variance * room) / np.sum(room * (w > 0)))
-        return variance[0], expected, sandwich(rows, w, w * variance, self.cofactor[None])[0]
+        expected = float(np.sum(w * own * room) / np.sum(room * (w > 0)))
+        return own[0], expected, sandwich(rows, w, w * own, self.cofactor[None])[0]
 
     def _moved_by(self, felt: Float) -> Float:
         """Return what errors of the slopes do to the estimate, shape (9, 6)."""
