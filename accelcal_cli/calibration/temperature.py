@@ -124,7 +124,7 @@ def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
 
 
 def slope_rows(output: Float, degrees: Float, slopes: Temperature, sensor: ErrorModel, g: float) -> Float:
-    """Return d e / d slopes of readings, each as force at half the range of temperature, shape (J, 6).
+    """Return d e / d slopes of readings, e = (g^2 - |f|^2) / 2g, slopes as force at half the range, shape (J, 6).
 
     Args:
         output: readings at their own temperatures, shape (J, 3); degrees: these, shape (J,).
@@ -133,7 +133,7 @@ def slope_rows(output: Float, degrees: Float, slopes: Temperature, sensor: Error
     half = 0.5 * (slopes.high - slopes.low)
     p = np.concatenate([np.zeros(9), g * half * slopes.scale, half * slopes.bias / np.diagonal(sensor.K)])
     _, J = _linearised(output, (degrees - slopes.reference) / half, sensor, p, g)
-    return J[:, 9:]
+    return -J[:, 9:]
 
 
 def _unsuitable(solution: Solution, degrees: Float) -> str:
