@@ -40,7 +40,7 @@ POORER: dict[Weights, Weights] = {"auto": "n", "sd": "n", "n": "none"}
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class Brought:
     """The readings as the result sees them.
 
     Attributes:
@@ -54,15 +54,15 @@ class Reference:
     notes: tuple[str, ...] = ()
 
 
-def at_reference(old: Calibration, readings: Readings) -> Reference:
+def at_reference(old: Calibration, readings: Readings) -> Brought:
     """Return readings as they would be at the temperature of the result, as far as both are known."""
     slopes = old.temperature
     if slopes is None:
-        return Reference(readings)
+        return Brought(readings)
     degrees = readings.temperature
     if degrees is None or not np.isfinite(degrees).all():
         note = f"The new readings have no temperatures; they are assumed to be at {slopes.reference:.4g} degrees."
-        return Reference(readings, notes=(note,))
+        return Brought(readings, notes=(note,))
     from accelcal_cli.calibration.temperature import slope_rows
 
     output = readings.output()
@@ -73,7 +73,7 @@ def at_reference(old: Calibration, readings: Readings) -> Reference:
             f"The new readings, at {degrees.min():.4g} to {degrees.max():.4g} degrees, go beyond the {slopes.low:.4g} "
             f"to {slopes.high:.4g} degrees of the result: how uncertain its slopes with temperature are counts there.",
         )
-    return Reference(readings.with_output(slopes.at_reference(output, degrees, old.D_a)), felt, notes)
+    return Brought(readings.with_output(slopes.at_reference(output, degrees, old.D_a)), felt, notes)
 
 
 def stated_as(old: Calibration, readings: Readings) -> tuple[Stated, tuple[str, ...]]:

@@ -201,8 +201,8 @@ def _check(old: Calibration) -> None:
     result = f"the result of {old.data.get('source', 'result')}"
     if old.verdict == "undetermined" or not np.isfinite(old.covariance).all():
         raise DataError(
-            f"{result} has no uncertainty for all its parameters (verdict {old.verdict}, {old.poses} poses); verify "
-            "needs one with verdict good or weak from ten poses or more"
+            f"{result} has no uncertainty for all {'six' if old.held.any() else 'nine'} parameters (verdict "
+            f"{old.verdict}, {old.poses} poses); verify needs one with verdict good or weak from ten poses or more"
         )
     if old.freedom < 1 or old.coverage_factor is None or not old.s > 0:
         raise DataError(f"{result} states no noise s; verify needs one from ten poses or more")
