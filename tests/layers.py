@@ -41,6 +41,7 @@ INSIDE = {
         "consensus",
         "weights",
         "covariance",
+        "triangle",
         "problem",
         "result",
         "search",

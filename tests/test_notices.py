@@ -6,7 +6,6 @@ import re
 import shlex
 
 import numpy as np
-import pytest
 import typer
 from simulated import DPSO, noise, readings
 
@@ -18,11 +17,12 @@ from accelcal_cli.io.readings import Readings, doubts, log_warnings
 from accelcal_cli.notices import COMMAND, Notice, are_serious, in_one
 from accelcal_cli.sensor import poses
 
-KEYS = (
-    "log several-sensors duplicate-rows zero-rows frozen clipped gravity-removed never-moved wrong-gravity outliers "
-    "large-misalignment residuals noise-bias tremor correlated unequal-noise few-attitudes box thousands dead-axis "
-    "unfinished-search perpendicular negative-axes legacy"
-).split()
+KEYS = {
+    *("log", "several-sensors", "duplicate-rows", "zero-rows", "frozen", "clipped", "gravity-removed"),
+    *("never-moved", "wrong-gravity", "outliers", "large-misalignment", "residuals", "noise-bias", "tremor"),
+    *("correlated", "unequal-noise", "few-attitudes", "box", "thousands", "dead-axis", "unfinished-search"),
+    *("perpendicular", "negative-axes", "legacy"),
+}
 """Those that programs may rely on."""
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
@@ -42,7 +42,6 @@ def _all():
     ]
     u = G * poses.turns() + noise(24, 1e-3, 2)
     known = Readings.from_array(DPSO.output(u), reference=-G * poses.turns())
-    walled = Settings(g=G, optimizer="levenberg-marquardt", nominal={"scale": (1e3,) * 3, "bias": (0,) * 3})
     stopped = Settings(g=G, polish=False, parameters={"iterations": 1})
     return [
         *logs,
@@ -70,7 +69,9 @@ def test_a_notice_is_its_sentence_and_what_to_do():
 def test_every_remedy_is_an_action_or_a_command_that_runs():
     """Its command and its options exist; the file it names is the one that was read."""
     group = typer.main.get_command(app)
-    calibrate_options = {o for p in group.get_command(None, "calibrate").params for o in (*p.opts, *p.secondary_opts)}
+    calibrate_options = {
+        o for p in group.get_command(None, "calibrate").params for o in (*p.opts, *p.secondary_opts)
+    }
     seen = _all()
     assert {"log", "dead-axis", "duplicate-rows", "outliers", "residuals"} < {notice.key for notice in seen}
     for notice in seen:

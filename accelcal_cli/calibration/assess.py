@@ -28,6 +28,7 @@ from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.calibration.weights import SURELY_TREMBLES
 from accelcal_cli.notices import Notice, Severity, are_serious
+from accelcal_cli.sensor.poses import AXES, axis_up
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -170,6 +171,7 @@ def _outliers(fit: Fit) -> list[tuple[int, ...]]:
     if fit.solution is None or fit.settings.robust != "none":
         return outliers
     bent = (fit.s > LARGE * fit.settings.g) | (outlier.sum(axis=1) > 1) | fit.at_wall.any(axis=1)
+    bent &= np.array([word != "undetermined" for word in fit.geometry.observability.verdicts])
     for at in np.flatnonzero(bent).tolist():
         agreement = consensus(fit.sample.take(np.array([at])), fit.settings)
         if agreement is not None and not agreement.agreeing.all():
@@ -283,8 +285,9 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
     walled = bool(fit.at_wall[at].any()) and fit.geometry.observability[at].verdict != "undetermined"
     spread = fit.spread
     return (
-        *lines,
         *((WALLED,) if walled else ()),
+        *lines,
+        *_against_labels(fit, at),
         *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at])),
         *_less_than_noise(fit, at),
         *_noise_bias(fit, at),
@@ -519,3 +522,42 @@ def _turned_round(K: Float) -> tuple[Notice, ...]:
         "at rest points up."
     )
     return (Notice("negative-axes", "note", text, "Turn the sign of the reference (columns fx, fy, fz)."),)
+
+
+SAID = 0.5
+"""Least part of the force along an axis at which a label that calls this axis up or down can be contradicted."""
+
+
+def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a note of axes that the fit has the other way round than most labels that say which way is up."""
+    if fit.view[at].verdict == "undetermined":
+        return ()
+    readings, residuals = fit.sample.readings(at), fit.residuals
+    real = residuals.real[at]
+    votes = np.zeros(
+        (3, 2), dtype=int
+    )  # of each axis: labels that the fit bears out, and that it contradicts
+    for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
+        said = axis_up(readings.where(pose))
+        if said is not None:
+            axis, up = said
+            part = up * float(force[axis]) / fit.settings.g
+            votes[axis] += (part > SAID, part < -SAID)
+    turned = votes[:, 1] > votes[:, 0]
+    if not turned.any():
+        return ()
+    names = " and ".join(axis for axis, other in zip(AXES, turned, strict=True) if other)
+    if (turned | (votes.sum(axis=1) == 0)).all():
+        text = (
+            f"By the labels of the poses every axis that they name ({names}) points the other way than in the fit, "
+            "which cannot tell f from -f: the sensor may count gravity instead of specific force, and f comes out "
+            "with the other sign."
+        )
+        remedy = "If the labels are right, turn the sign of all three columns."
+    else:
+        text = (
+            f"By the labels of the poses axis {names} points the other way than in the fit, which cannot tell a sensor "
+            "from its mirror image."
+        )
+        remedy = f"If the labels are right, turn the sign of column {names}."
+    return (Notice("negative-axes", "note", text, remedy),)

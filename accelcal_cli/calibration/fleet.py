@@ -16,7 +16,13 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.assess import Assessment
 from accelcal_cli.calibration.calibrate import assessed, record
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
-from accelcal_cli.calibration.observability import PARAMETERS, ROWS_COLUMNS, SCALE
+from accelcal_cli.calibration.observability import (
+    PARAMETERS,
+    SCALE,
+    engineering_chain,
+    engineering_quantities,
+    propagated,
+)
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
 from accelcal_cli.calibration.search import NO_NOISE
@@ -55,8 +61,10 @@ class Fleet:
         number: the sensors' numbers among the readings, shape (R,); poses: J of each.
         K_a, D_a: in the gauge of the settings, shapes (R, 3, 3) and (R, 3); sigma_k, sigma_d: their one-sigma.
         coverage: factor from a sigma to the half-width of its 95 % interval, shape (R,).
-        parameters: the nine of `PARAMETERS` as an engineer takes them, gauge `lower`, shape (R, 9): K_ii in output
-            units per m/s^2, K_ij / K_ii in mrad, D_i / K_ii in micro-g.
+        parameters: the nine as an engineer takes them, see `engineering_quantities`, shape (R, 9): sensitivities in
+            output units per m/s^2, misalignments in mrad, biases in micro-g.
+        gain: their errors, of sensitivities as a part of themselves and else in rad and m/s^2, over the noise of a pose
+            in m/s^2, shape (R, 9).
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
         verdict: good, weak, suspect, undetermined or failed, shape (R,); reason: what the poses leave open, or why it
@@ -72,6 +80,7 @@ class Fleet:
     D_a: Float
     sigma_k: Float
     sigma_d: Float
+    gain: Float
     coverage: Float
     parameters: Float
     dop: Float
@@ -180,8 +189,9 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         D_a=fit.D,
         sigma_k=fit.sigma_K,
         sigma_d=fit.sigma_D,
+        gain=propagated(engineering_chain(fit.lower, fit.D, fit.settings.g), fit.view.cofactor),
         coverage=fit.coverage,
-        parameters=_parameters(fit.lower, fit.D, settings.g),
+        parameters=engineering_quantities(fit.lower, fit.D) * _units(settings.g),
         dop=fit.view.dop,
         cost=fit.value,
         s=fit.s,
@@ -216,6 +226,7 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
         D_a=nan(3),
         sigma_k=nan(3, 3),
         sigma_d=nan(3),
+        gain=nan(9),
         coverage=nan(),
         parameters=nan(9),
         dop=nan(9),
@@ -246,20 +257,16 @@ class Standout:
     z: float | None
 
 
-def _parameters(K: Float, D: Float, g: float) -> Float:
-    """Return `Fleet.parameters`, shape (R, 9), of K, gauge `lower`, shape (R, 3, 3), and D, shape (R, 3)."""
-    scale = np.einsum("rii->ri", K)
-    angles = [K[:, i, j] / scale[:, i] * units.MRAD for i, j in ROWS_COLUMNS[3:6]]
-    return np.concatenate([scale, np.stack(angles, axis=1), D / scale / g * units.MICRO_G], axis=1)
+def _units(g: float) -> Float:
+    """Return the sizes of the units of `Fleet.parameters`, shape (9,): 1, mrad and micro-g."""
+    return np.repeat([1.0, units.MRAD, units.MICRO_G / g], 3)
 
 
 def _gains(fleet: Fleet, g: float) -> Float:
     """Return the errors of `Fleet.parameters` over the noise of a pose in m/s^2, shape (R, 9)."""
-    scale = fleet.parameters[:, SCALE]
-    unit = np.concatenate(
-        [scale, np.full_like(scale, units.MRAD), np.full_like(scale, units.MICRO_G)], axis=1
-    )
-    return np.asarray(unit * (fleet.dop / g))
+    gains = fleet.gain * _units(g)
+    gains[:, SCALE] *= fleet.parameters[:, SCALE]
+    return gains
 
 
 def standouts(fleet: Fleet, g: float) -> list[Standout]:

@@ -19,6 +19,7 @@ from accelcal_cli.calibration.covariance import plain_spread
 from accelcal_cli.calibration.fit import Fit, coverage_of, uncalibrated
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability
 from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL, PoseResiduals, room_of
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search
 from accelcal_cli.calibration.settings import Settings
@@ -163,10 +164,16 @@ def _nine(K: Float, low: Float, cofactor: Float, noise: Float) -> Float:
     """Return the covariance of the nine parameters, shape (9, 9), for K, K in gauge `lower`, and (F^T W F)^-1.
 
     `noise` is the covariance of one pose as force, shape (3, 3).
+    """
+    chain = _chain(K, low)
+    return np.asarray(chain @ np.kron(noise, cofactor) @ chain.T)
 
-    By d (nine parameters of gauge `lower`) / d Y, shape (9, 12): [dK_a dD_a] = K_a Y with Y in units of force (its
-    first three columns at 1 g), rows running slowest. So E = -Y / g in the body frame, R E R^T in that of gauge
-    `lower`, and of it the rotation is no change of the sensor.
+
+def _chain(K: Float, low: Float) -> Float:
+    """Return d (nine parameters of gauge `lower`) / d Y, shape (9, 12), for K and K in gauge `lower`.
+
+    [dK_a dD_a] = K_a Y with Y in units of force (its first three columns at 1 g), rows running slowest. So E = -Y / g
+    in the body frame, R E R^T in that of gauge `lower`, and of it the rotation is no change of the sensor.
     """
     R = np.linalg.solve(low, K)
     columns = []
@@ -177,8 +184,30 @@ def _nine(K: Float, low: Float, cofactor: Float, noise: Float) -> Float:
         both = E + E.T
         column = [both[i, j] * (0.5 if i == j else 1.0) for i, j in ROWS_COLUMNS[:6]]
         columns.append([*column, *(K @ Y[:, 3] / np.diagonal(low))])
-    chain = np.array(columns).T
-    return np.asarray(chain @ np.kron(noise, cofactor) @ chain.T)
+    return np.array(columns).T
+
+
+def covariance_of_twelve(result: Calibration) -> Float:
+    """Return the covariance of Y, shape (12, 12), (m/s^2)^2, of a result with known attitudes: see `_chain`.
+
+    Definition: B x C, B the noise of the three axes in the body frame (one, where it is the same in all), C the
+    covariance (F^T W F)^-1 s^2 of a row of Y. A record has C as what its nine parameters' covariance is made of:
+    linear in C, and with more equations than C has entries. NaN where it has none.
+    """
+    K = result.K_a
+    if not np.isfinite(result.covariance).all():
+        return np.full((12, 12), np.nan)
+    noise = np.linalg.solve(K, np.diag(result.sigma.D_a))
+    B = noise @ noise.T
+    B *= 3.0 / np.trace(B)
+    chain = _chain(K, to_gauge(K, "lower"))
+    entries = [(i, j) for i in range(4) for j in range(i + 1)]
+    units = [np.zeros((4, 4)) for _ in entries]
+    for unit, (i, j) in zip(units, entries, strict=True):
+        unit[i, j] = unit[j, i] = 1.0
+    parts = np.stack([(chain @ np.kron(B, unit) @ chain.T).ravel() for unit in units], axis=1)
+    sizes = np.linalg.lstsq(parts, result.covariance.ravel())[0]
+    return np.asarray(np.kron(B, np.tensordot(sizes, units, axes=1)), dtype=float)
 
 
 def _residuals(

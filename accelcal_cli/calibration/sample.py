@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,8 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.screening import LOOKED_AT
+from accelcal_cli.sensor.poses import axis_up
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -35,6 +37,15 @@ NORMAL_MAD = 1.4826
 
 SCALE_SAMPLE = 100_000
 """At most about this many residuals decide the scale of a robust loss."""
+
+
+def _name_up(where: Callable[[int], str], poses: Iterable[int]) -> bool:
+    """Whether a pose's name says which way an axis points."""
+    names = (where(pose) for pose in poses)
+    first = next(names, "")
+    if not first.startswith("position "):  # the number of a line, as are all others
+        return False
+    return axis_up(first) is not None or any(axis_up(name) is not None for name in names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +99,12 @@ class Sample:
             lower=np.stack([one.lower for one in readings]),
             upper=np.stack([one.upper for one in readings]),
             blocks=blocks,
-            doubtful=np.array([bool(one.warnings) for one in readings]),
+            doubtful=np.array(
+                [
+                    bool(one.warnings) or _name_up(one.where, range(min(one.poses, LOOKED_AT)))
+                    for one in readings
+                ]
+            ),
             labelled=np.array([one.labels is not None for one in readings]),
             readings=readings.__getitem__,
             count=stack("count"),
@@ -101,12 +117,15 @@ class Sample:
     @classmethod
     def of_batch(cls, fleet: FleetReadings, batch: Batch) -> Sample:
         """Return the sample of a batch of a fleet."""
+        doubtful = fleet.doubtful(batch)
+        if _name_up(fleet.where, batch.pose[:1].ravel().tolist()):  # one table, one kind of labels
+            doubtful = np.ones_like(doubtful)
         return cls(
             poses=batch.count,
             lower=batch.output.min(axis=1),
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
-            doubtful=batch.doubtful,
+            doubtful=doubtful,
             labelled=fleet.labelled(batch),
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,

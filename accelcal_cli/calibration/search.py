@@ -15,10 +15,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.consensus import consensus
-from accelcal_cli.calibration.problem import Loetters, compress, opened
+from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.calibration.weights import (
     SURELY_TREMBLES,
     PoseNoise,
@@ -164,6 +165,14 @@ class Solution:
     slopes: Slopes | None = None
     notes: tuple[str, ...] = ()
 
+    def robust_weights(self) -> Float | None:
+        """Return the weights of the poses with those of a robust loss, shape (R, J), or None where all count alike."""
+        weights, noise, settings = self.stated.weights, self.noise, self.stated.settings
+        if noise is None or (noise <= NO_NOISE * settings.g).all():
+            return weights
+        parts = self.sample.reweighted(*self.cost.parameters(self.x), settings, noise, weights)
+        return np.concatenate([np.asarray(weight) for _, weight in parts], axis=1)
+
     def solved_anew(self, cost: Loetters) -> Solution:
         """Return the solution carried over to a cost that differs a little: polished from where it was."""
         polished = polish(cost, self.x)
@@ -179,14 +188,24 @@ def state(sample: Sample, settings: Settings) -> Stated:
     if sample.scatter is not None and sample.count is not None:
         stated = _with_noise(stated)
     if settings.robust != "none":
-        agreement = consensus(stated.sample, settings)
-        if agreement is not None and not agreement.agreeing.all():
-            stated = replace(stated, rejected=~agreement.agreeing[None]).with_weights(stated.weights)
-    if stated.noise is None or settings.weights not in ("sd", "auto"):
-        return stated
-    weights = stated.sample.normalised(_inverse(stated.noise.variance))
-    stated = stated.with_weights(weights)
-    return _shared(stated) if settings.weights == "auto" else stated
+        stated = agreed(stated)
+    elif stated.noise is not None and settings.weights in ("sd", "auto"):
+        stated = stated.with_weights(own_weights(stated))
+    return _shared(stated) if settings.weights == "auto" and stated.noise is not None else stated
+
+
+def agreed(stated: Stated) -> Stated:
+    """Return the problem of one sensor without the poses that disagree with the others, weighted as is asked for."""
+    agreement = consensus(stated.sample, stated.settings)
+    rejected = None if agreement is None or agreement.agreeing.all() else ~agreement.agreeing[None]
+    return replace(stated, rejected=rejected).with_weights(own_weights(stated))
+
+
+def own_weights(stated: Stated) -> Float | None:
+    """Return the weights asked for, before a pose is left out or an error is shared, shape (R, J), or None."""
+    if stated.noise is not None and stated.settings.weights in ("sd", "auto"):
+        return stated.sample.normalised(_inverse(stated.noise.variance))
+    return stated.sample.counts(stated.settings.weights)
 
 
 def _inverse(variance: Float) -> Float:

@@ -17,13 +17,25 @@ from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS,
 from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import SHARED_ROUNDS, SHARED_SETTLED, SLOPES, Slopes, Solution, share
+from accelcal_cli.calibration.search import (
+    SHARED_ROUNDS,
+    SHARED_SETTLED,
+    SLOPES,
+    Slopes,
+    Solution,
+    agreed,
+    reweight,
+    share,
+)
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
 SMALLEST_RANGE = 5.0
 """Degrees between the coldest and the warmest pose below which slopes would be extrapolated at once."""
 
 MOST_POSES = 100_000
+ROBUST_ROUNDS, ROBUST_SETTLED = 10, 0.1
+"""Rounds at most in which slopes and robust weights follow each other, and the part of a sigma that ends them."""
+
 STEPS, SETTLED = 30, 1e-12
 """Gauss-Newton steps at most, and the step, as part of g, that ends them."""
 
@@ -45,16 +57,20 @@ def with_slopes(solution: Solution) -> Solution:
         why = why or "the poses do not determine slopes with temperature"
         return replace(solution, notes=(*solution.notes, f"Temperature column not used: {why}."))
     slopes, brought = fitted
-    triangle = packed(brought, solution.stated.weights, within=sample)
-    cost = Loetters(triangle, settings.g, solution.cost.box)
+    plain, cost = (
+        Loetters(packed(brought, weights, within=sample), settings.g, solution.cost.box)
+        for weights in (solution.stated.weights, solution.robust_weights())
+    )
     middle = slopes.temperature.reference
     note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
     notes = (*solution.notes, note)
-    return replace(solution.solved_anew(cost), sample=brought, plain=cost, slopes=slopes, notes=notes)
+    return replace(solution.solved_anew(cost), sample=brought, plain=plain, slopes=slopes, notes=notes)
 
 
 def _settled(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes, Sample] | None]:
     """Return the solution with the weights that go with slopes, and these as `_fit` does: they leave a shared error."""
+    if solution.stated.settings.robust != "none":
+        return _robust(solution, degrees)
     fitted, stated = _fit(solution, degrees), solution.stated
     if fitted is None or stated.settings.weights != "auto" or stated.noise is None:
         return solution, fitted
@@ -73,12 +89,36 @@ def _settled(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes
     return solution, _fit(solution, degrees)
 
 
+def _robust(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes, Sample] | None]:
+    """Return a robust solution with slopes: readings brought to one temperature say anew which of them agree.
+
+    Drift makes sound poses look wrong at first; as the slopes come out, they come back.
+    """
+    readings = solution.stated.sample
+    fitted, before = _fit(solution, degrees), np.full(6, np.inf)
+    for _ in range(ROBUST_ROUNDS):
+        if fitted is None:
+            return solution, None
+        slopes, brought = fitted
+        here = np.concatenate([slopes.temperature.scale, slopes.temperature.bias])
+        sigma = np.concatenate([slopes.temperature.sigma_scale, slopes.temperature.sigma_bias])
+        if (np.abs(here - before) <= ROBUST_SETTLED * sigma).all():
+            break
+        before = here
+        stated = agreed(replace(solution.stated, sample=brought))
+        x = stated.cost.coordinates(*slopes.sensor)
+        start = replace(solution, stated=stated, sample=brought, cost=stated.cost, plain=stated.cost, x=x)
+        solution = reweight(start.solved_anew(stated.cost))
+        fitted = _fit(replace(solution, stated=replace(stated, sample=readings)), degrees)
+    return replace(solution, stated=replace(solution.stated, sample=readings)), fitted
+
+
 def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
     """Return the slopes, and the readings brought to the reference temperature; None where nothing determines them.
 
     `degrees`: temperatures of the poses, shape (J,).
     """
-    sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.stated.weights
+    sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.robust_weights()
     K, D = solution.cost.parameters(solution.x)
     low = ErrorModel(to_gauge(K[0], "lower"), D[0])
     N = sample.output()[0]
@@ -139,8 +179,6 @@ def slope_rows(output: Float, degrees: Float, slopes: Temperature, sensor: Error
 def _unsuitable(solution: Solution, degrees: Float) -> str:
     """Return why temperatures, shape (J,), cannot be used, or nothing."""
     settings, poses = solution.stated.settings, len(degrees)
-    if settings.robust != "none":
-        return "slopes with temperature go with plain least squares only"
     if not settings.misalignment:
         return "slopes with temperature are fitted beside misalignments only"
     if poses > MOST_POSES:

@@ -23,6 +23,7 @@ def command(
         typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.", rich_help_panel="Input"),
     ],
     columns: options.Columns = None,
+    where: options.Where = None,
     force: options.Force = False,
     unit: Annotated[
         str | None,
@@ -56,6 +57,7 @@ def command(
     text. The log streams through: memory does not grow with it.
     """
     from accelcal_cli.calibration.apply import ColumnOptions, prepare
+    from accelcal_cli.io.columns import restrict
     from accelcal_cli.io.reader import open_table
     from accelcal_cli.output.files import whole_file
 
@@ -67,6 +69,7 @@ def command(
     options.warn(result, calibration.warnings, quiet)
     table = open_table(data, sys.stdin.buffer, hashed=False)
     try:
+        restrict(table, where or ())
         log = prepare(calibration, table, options.split_columns(columns), wanted)
         parquet = Path(output).suffix.lower() in PARQUET
         if parquet and not log.parquet:

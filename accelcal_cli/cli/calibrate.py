@@ -103,6 +103,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
+    where: options.Where = None,
     gravity: options.GravityOptions,
     config: Annotated[
         Path | None, options.in_input(help="YAML file: optimizer, its parameters, box, gauge, ...")
@@ -144,9 +145,11 @@ def command(
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)
     if raw:
-        readings = log.poses(data, columns, settings.g, settings.misalignment)
+        readings = log.poses(data, columns, where, settings.g, misalignment=settings.misalignment)
     else:
-        readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+        readings = read_readings(
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()
+        )
     result = calibrate(readings, settings)
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():

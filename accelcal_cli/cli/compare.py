@@ -91,6 +91,7 @@ def command(
         ),
     ] = None,
     columns: options.Columns = None,
+    where: options.Where = None,
     g: Annotated[
         float | None,
         options.in_input(
@@ -165,9 +166,9 @@ def command(
     entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
     source: Simulation | Recording
     if data is not None:
-        source = _recorded(data, columns, space.g, simulation)
-    elif columns is not None:
-        raise UsageError("--columns needs a file of readings")
+        source = _recorded(data, columns, where, space.g, simulation)
+    elif columns is not None or where:
+        raise UsageError(f"{'--where' if columns is None else '--columns'} needs a file of readings")
     else:
         source = simulation.scenario()
     study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
@@ -184,7 +185,9 @@ def command(
     options.tell_written([study_options.raw, plot], study_options.quiet)
 
 
-def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOptions) -> Recording:
+def _recorded(
+    data: str, columns: str | None, where: list[str] | None, g: float, simulation: SimulationOptions
+) -> Recording:
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.studies.scenarios import Recording
 
@@ -192,4 +195,6 @@ def _recorded(data: str, columns: str | None, g: float, simulation: SimulationOp
     if stated:
         raise UsageError(f"{', '.join(stated)}: not with a file of readings, which are not simulated")
     options.check_input(data)
-    return Recording.of(read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer), g)
+    return Recording.of(
+        read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()), g
+    )

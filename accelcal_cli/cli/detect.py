@@ -23,6 +23,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
+    where: options.Where = None,
     gravity: options.GravityOptions,
     log: options.DetectionOptions,
     output: Annotated[
@@ -57,7 +58,7 @@ def command(
     options.check_plot(plot)
     local_g = gravity.stated() or STANDARD_GRAVITY
     try:
-        detection = log.detect(data, columns, local_g, picture=plot is not None)
+        detection = log.detect(data, columns, where, local_g, picture=plot is not None)
     except TooFewPosesError as failure:
         _draw(failure.detection, plot, quiet)
         raise
@@ -70,6 +71,7 @@ def command(
             format, lambda: poses, lambda: views.blocks(detection), lambda: views.record(detection)
         )
     sys.stdout.flush()
+    options.warn(data, detection.warnings, quiet)
     options.tell_written([output], quiet)
     _draw(detection, plot, quiet)
 

@@ -45,6 +45,7 @@ def command(
         ),
     ] = None,
     columns: options.Columns = None,
+    where: options.Where = None,
     gravity: options.GravityOptions,
     config: Annotated[
         Path | None, options.in_input(help="YAML file: box, nominal, gauge, weights, g.")
@@ -111,7 +112,9 @@ def command(
             f"{config}: temperature: true: a fleet goes without slopes; calibrate this sensor by itself"
         )
     check_settings(settings)
-    readings = read_fleet(data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer)
+    readings = read_fleet(
+        data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer, where=where or ()
+    )
     if folder and output is not None:
         with whole_folder(output) as results:
             fleet = calibrate_fleet(

@@ -159,6 +159,12 @@ Columns = Annotated[
     str | None,
     in_input("--columns", help="The three output columns: names, or numbers from 1, separated by commas."),
 ]
+Where = Annotated[
+    list[str] | None,
+    in_input(
+        "--where", help="Read only rows with this value, as device=0; repeatable.", metavar="COLUMN=VALUE"
+    ),
+]
 Force = Annotated[bool, in_input("--force", help="Use a result although its verdict is undetermined.")]
 Format = Annotated[
     str,
@@ -286,22 +292,26 @@ class DetectionOptions:
         if detection and not raw:
             raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
 
-    def poses(self, data: str, columns: str | None, g: float, misalignment: bool) -> Readings:
+    def poses(
+        self, data: str, columns: str | None, where: list[str] | None, g: float, *, misalignment: bool
+    ) -> Readings:
         """Return the static poses of a raw log; faces are enough of them where no misalignment is asked for.
 
         Args:
-            data, columns, g: see `detect`.
+            data, columns, where, g: see `detect`.
             misalignment: whether misalignments are to be estimated.
         """
         few = self.min_poses is None and not misalignment
-        return (replace(self, min_poses=FACES) if few else self).detect(data, columns, g).readings()
+        return (replace(self, min_poses=FACES) if few else self).detect(data, columns, where, g).readings()
 
-    def detect(self, data: str, columns: str | None, g: float, picture: bool = False) -> Detection:
+    def detect(
+        self, data: str, columns: str | None, where: list[str] | None, g: float, picture: bool = False
+    ) -> Detection:
         """Find the static poses of a raw log.
 
         Args:
             data: file, or - for standard input.
-            columns: option --columns.
+            columns: option --columns; where: options --where.
             g: local gravity, m/s^2.
             picture: keep what a picture of the log needs.
         """
@@ -311,7 +321,12 @@ class DetectionOptions:
         check_input(data)
         settings = self._settings(g)
         log = open_raw_log(
-            data, split_columns(columns), split_columns(self.gyro), self.time, stdin=sys.stdin.buffer
+            data,
+            split_columns(columns),
+            split_columns(self.gyro),
+            self.time,
+            stdin=sys.stdin.buffer,
+            where=where or (),
         )
         try:
             return detect(log, settings, picture)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Int
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.observability import Observability, attitudes, directions_of
 from accelcal_cli.calibration.sample import Sample
@@ -25,11 +25,15 @@ from accelcal_cli.detection.intervals import (
     find_intervals,
     find_level,
     merge,
+    sample_windows,
 )
+from accelcal_cli.detection.log_screening import Liveliness, alternating, check_gravity
 from accelcal_cli.detection.rawlog import RawLog
-from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, read_tiles
+from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, read_tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.screening import LOOKED_AT, Screened
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
@@ -99,6 +103,7 @@ class Detection:
         level: what the multipliers apply to; multiplier: the one kept; candidates: all of them.
         intervals: the poses.
         envelope: of the log, for a picture; None unless asked for.
+        warnings: what the rows show that is no rest.
     """
 
     source: str
@@ -114,12 +119,26 @@ class Detection:
     settings: DetectSettings
     notes: tuple[str, ...]
     envelope: Envelope | None = None
+    warnings: tuple[Notice, ...] = ()
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
-        return readings_of(self.intervals, self.source).known_as(
-            self.sha256, self.columns, (*self.notes, self.summary()), self.intervals.where
+        intervals, notes = self.intervals, (*self.notes, self.summary())
+        readings = readings_of(intervals, self.source)
+        said = {notice.key for notice in self.warnings}
+        first = slice(LOOKED_AT)
+        screened = Screened(
+            intervals.mean[first],
+            self.columns,
+            len(intervals),
+            intervals.where,
+            self.source,
+            single=False,
+            count=intervals.n[first].astype(float),
+            scatter=intervals.scatter[first],
         )
+        more = [notice for notice in screened.notices() if notice.key not in said]
+        return readings.known_as(self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more))
 
     def summary(self) -> str:
         """Return what was found, and with which settings, in one sentence."""
@@ -156,14 +175,22 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     rate = settings.rate if settings.rate is not None else log.clock.rate
     lengths = settings.spans.rows(rate)
     envelope = Envelope(lengths.tile) if picture else None
+    in_turn = alternating(*_parted(log))
     tiles = read_tiles(log, lengths, envelope)
-    level = find_level(tiles, lengths, log.name)
+    level, lively = _screened(tiles, lengths, log)
     segmentations = find_intervals(tiles, lengths, level, settings.multipliers)
     candidates = tuple(evaluate(segmentation, settings.g) for segmentation in segmentations)
     enough = [k for k, c in enumerate(candidates) if c.attitudes >= settings.least_poses]
     kept = best(enough, candidates) if enough else nearest(segmentations, candidates)
     intervals = segmentations[kept].intervals
     gaps = tiles.gaps.notes(log.clock.unit)
+    zeros, shown = log.zeros, intervals if not enough else _combine(intervals, settings)
+    warnings = (
+        *in_turn,
+        *lively.clipped(shown, log.columns.names),
+        *lively.notices(tiles.size),
+        *zeros.notices(log.where, tiles.rows - zeros.count),
+    )
     detection = Detection(
         source=log.name,
         sha256=log.sha256,
@@ -174,15 +201,35 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         level=level,
         multiplier=candidates[kept].multiplier,
         candidates=candidates,
-        intervals=_combine(intervals, settings) if enough else intervals,
+        intervals=shown,
         settings=settings,
         notes=(*log.notes, *gaps),
+        warnings=warnings,
         envelope=envelope,
     )
     if not enough:
         why = explain_too_few(segmentations[kept], candidates[kept], detection)
         raise TooFewPosesError("; ".join([f"{log.name}: {why}", *gaps]), detection)
     return detection
+
+
+def _parted(log: RawLog) -> tuple[Float, Float | None]:
+    """Return acceleration and time of the first rows of a log."""
+    head = log.head()
+    return head[:, :3], None if log.columns.time is None else head[:, -1]
+
+
+def _screened(tiles: Tiles, lengths: RowLengths, log: RawLog) -> tuple[StillLevel, Liveliness]:
+    """Leave out what is frozen, and return what counts as still in the rest; DataError where no gravity turns."""
+    sample = sample_windows(tiles, lengths, log.name)
+    level = find_level(tiles, lengths, log.name, sample)
+    lively = Liveliness.of(tiles, level)
+    tiles.unusable = lively.unusable(tiles)
+    if lively.frozen:
+        sample = sample_windows(tiles, lengths, log.name)
+        level = find_level(tiles, lengths, log.name, sample)
+    check_gravity(sample, level, log.name, log.columns.names, log.gyro_names())
+    return level, lively
 
 
 def evaluate(segmentation: Segmentation, g: float) -> CandidateThreshold:
@@ -231,8 +278,10 @@ def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
 
 
 def readings_of(intervals: Intervals, source: str) -> Readings:
-    """Return the intervals as readings: mean, count and scatter of each."""
-    return Readings.from_array(intervals.mean, source=source, count=intervals.n, scatter=intervals.scatter)
+    """Return the intervals as readings, not screened: mean, count and scatter of each."""
+    return Readings.from_array(
+        intervals.mean, source=source, count=intervals.n, scatter=intervals.scatter, warnings=()
+    )
 
 
 def explain_too_few(segmentation: Segmentation, count: CandidateThreshold, detection: Detection) -> str:

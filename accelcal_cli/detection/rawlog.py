@@ -19,11 +19,15 @@ from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.columns import RawColumns, choose_raw
+from accelcal_cli.io.columns import RawColumns, choose_raw, restrict
 from accelcal_cli.io.reader import InputTable, RowBlock, open_table, shorten
+from accelcal_cli.io.rows import OneSensor, ZeroRows
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
+
+HEAD = 20_000
+"""First rows that show whether several sensors take turns, at most."""
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of a time column, in seconds."""
@@ -46,6 +50,7 @@ def open_raw_log(
     time: str | None = None,
     *,
     stdin: BinaryIO | None = None,
+    where: Sequence[str] = (),
 ) -> RawLog:
     """Open a raw log in any form that `read_readings` reads; ``-`` is standard input.
 
@@ -55,9 +60,11 @@ def open_raw_log(
             gyroscope with `gyro` of ``["none"]``.
         time: a column, ``"none"``, or None to find it.
         stdin: standard input.
+        where: conditions on the rows, each as COLUMN=VALUE.
     """
     table = open_table(source, stdin)
     try:
+        restrict(table, where)
         return RawLog(table, choose_raw(table, columns, gyro, time))
     except BaseException:
         table.close()
@@ -71,8 +78,9 @@ class RawLog:
         """Read the first rows of `table` to find out what the time column is."""
         self.name = table.name
         self.columns = columns
+        self.zeros = ZeroRows()
         self._table = table
-        rows = table.blocks(columns.selection())
+        rows = _of_one(table.blocks(columns.selection()), OneSensor(table, columns.identity, fleet=False))
         self._rows = seconds_of_dates(rows, self._time_at) if columns.dated else rows
         self._head = _first(self._rows, PROBE)
         self.clock = Clock()
@@ -129,10 +137,24 @@ class RawLog:
         width, last = (6 if self.columns.gyro else 3) + timed, -np.inf
         for rows in chain(self._head, self._rows):
             numbers = rows.numbers[:, :width]
+            self.zeros.keep(numbers[:, :3], rows.start)
             if timed and len(numbers):
                 self._check_time(numbers[:, -1], last, rows.start)
                 last = float(numbers[-1, -1])
             yield numbers
+
+    def gyro_names(self) -> tuple[str, ...]:
+        """Return the names of the gyroscope columns, or their numbers from 1; none without a gyroscope."""
+        names = self._table.names
+        return tuple(str(k + 1) if names is None else names[k] for k in self.columns.gyro or ())
+
+    def head(self) -> Float:
+        """Return the first rows, as `blocks` yields them, of the first block of PROBE or more."""
+        timed = self.columns.time is not None
+        width = (6 if self.columns.gyro else 3) + timed
+        return np.concatenate([np.empty((0, width)), *(rows.numbers[:, :width] for rows in self._head)])[
+            :HEAD
+        ]
 
     def close(self) -> None:
         """Release the file."""
@@ -234,6 +256,13 @@ def _is_stamp(cell: str) -> bool:
         return cell[:4].isdigit() and not np.isnat(_read([cell])[0])
     except (ValueError, UserWarning):
         return False
+
+
+def _of_one(rows: Iterator[RowBlock], one: OneSensor) -> Iterator[RowBlock]:
+    """Yield rows, and refuse those of several sensors."""
+    for block in rows:
+        one.add(block)
+        yield block
 
 
 def _first(rows: Iterator[RowBlock], least: int) -> list[RowBlock]:

@@ -1,8 +1,7 @@
 """What every exporter is, and what all formats share: the origin of the numbers, their units, and what a format drops.
 
 A format is one file: a frozen dataclass derived from `Exporter` and entered in `EXPORTERS`. Help, completion, the
-documentation and the contract tests follow from the class. The help imports every format: numpy and what needs it are
-imported where a file is made.
+documentation and the contract tests follow from the class.
 """
 
 from __future__ import annotations
@@ -10,16 +9,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
+import numpy as np
+
+from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
 from accelcal_cli.schema import Checked, setting
-
-if TYPE_CHECKING:
-    from accelcal_cli.arrays import Float
-    from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.model import (
+    STANDARD_GRAVITY,
+    ErrorModel,
+    sensitivity,
+)
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -97,10 +100,8 @@ class DriverExporter(Exporter):
             UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver
                 scale that is not that of these readings.
         """
-        from accelcal_cli.sensor.model import ErrorModel
-
         metres = metres_per_unit(result)
-        scale = result.K_a.diagonal() / metres
+        scale = sensitivity(result.K_a) / metres
         if self.driver_scale is not None:
             near = scale / self.driver_scale
             if not (NEAR_ONE[0] < near.min() and near.max() < NEAR_ONE[1]):
@@ -117,29 +118,24 @@ class DriverExporter(Exporter):
         return ErrorModel(result.K_a, result.D_a * metres)
 
 
-@dataclass(frozen=True)
-class DiagonalExporter(DriverExporter):
-    """Base of the formats of targets that correct axis by axis and know no misalignments."""
+def is_mounted(result: Calibration) -> bool:
+    """Whether the result knows how the sensor lies in the body: its attitudes were known."""
+    return result.settings.get("attitudes") == "known"
 
-    def warnings(self, result: Calibration) -> tuple[str, ...]:
-        """Return the misalignments that are left out, in mrad and as force at 1 g, and what all formats leave out."""
-        import numpy as np
 
-        from accelcal_cli.sensor.model import MRAD
-        from accelcal_cli.sensor.poses import AXES
+BODY = {
+    "lower": "x along the x sensor axis, y in the plane of the x and y sensor axes (gauge lower)",
+    "upper": "z along the z sensor axis, y in the plane of the y and z sensor axes (gauge upper)",
+    "symmetric": "as near as can be to the three sensor axes (gauge symmetric)",
+    "full": "wherever the search ended (gauge full without known attitudes): only the length of the force counts",
+}
+"""Where the axes of the calibrated force lie, by gauge."""
 
-        further = super().warnings(result)
-        if result.held.any():
-            return further
-        rest = result.K_a / result.K_a.diagonal()[:, None] - np.eye(3)
-        i, j = np.unravel_index(int(np.abs(rest).argmax()), (3, 3))
-        angle = abs(float(rest[i, j]))
-        error = result.g * metres_per_unit(result) * float(np.linalg.norm(rest, 2))
-        return (
-            f"this format has no misalignments: up to {angle * MRAD:.3g} mrad ({angle:.3f} rad, axis {AXES[i]} towards "
-            f"{AXES[j]}) are dropped, an error of up to {error:.2g} m/s^2 at 1 g",
-            *further,
-        )
+
+def frame(result: Calibration) -> str:
+    """Return a sentence that says which axes the force has that a whole matrix makes."""
+    axes = "those of the reference fx, fy, fz" if is_mounted(result) else BODY[result.gauge]
+    return f"Axes of the force: {axes}."
 
 
 def origin(result: Calibration) -> list[str]:
@@ -159,18 +155,16 @@ def comment(lines: Iterable[str], mark: str = "#") -> str:
 
 
 def rows(matrix: Float) -> list[list[float]]:
-    """Return a matrix, or a vector as one row, as lists of plain numbers."""
-    return [[float(v) for v in row] for row in matrix.reshape(-1, matrix.shape[-1])]
+    """Return a matrix as lists of plain numbers."""
+    return [[float(v) for v in row] for row in np.atleast_2d(matrix)]
 
 
 def is_force(result: Calibration) -> bool:
     """Return whether the readings are specific force already, in the unit of the result."""
-    scale = result.K_a.diagonal()
+    scale = sensitivity(result.K_a)
     return bool(NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1])
 
 
 def metres_per_unit(result: Calibration) -> float:
     """Return how many m/s^2 one unit of the calibrated force is: 9.80665 for g, else 1."""
-    from accelcal_cli.sensor.model import STANDARD_GRAVITY
-
     return STANDARD_GRAVITY if result.unit == "g" else 1.0

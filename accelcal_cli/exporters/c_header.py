@@ -50,7 +50,7 @@ class CHeader(Exporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the header; a `*/` in the origin does not end its comment."""
-        lines = [line.replace("*/", "* /") for line in base.origin(result)]
+        lines = [line.replace("*/", "* /") for line in [*base.origin(result), base.frame(result)]]
         text = HEADER.format(
             origin=base.comment(lines, " *"),
             unit=result.unit,

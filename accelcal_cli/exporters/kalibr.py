@@ -41,7 +41,8 @@ class Kalibr(DriverExporter):
             model, unit = result.model.in_gauge("lower"), "unit of the readings"
         header = [
             *base.origin(result),
-            f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular (gauge lower).",
+            f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular.",
+            f"Axes of a: {base.BODY['lower']}, whatever the gauge of the result.",
         ]
         matrix = "".join(f"    - {row}\n" for row in base.rows(model.K))
         text = (

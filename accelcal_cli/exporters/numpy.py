@@ -38,6 +38,6 @@ class NumPy(Exporter):
             covariance=result.covariance,
             g=np.array(result.g),
             unit=np.array(result.unit),
-            origin=np.array("; ".join(base.origin(result))),
+            origin=np.array("; ".join([*base.origin(result), base.frame(result)])),
         )
         return file.getvalue()

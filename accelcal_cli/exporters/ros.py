@@ -31,6 +31,7 @@ class Ros(Exporter):
         header = [
             *base.origin(result),
             "imu_calib: corrected = SM * reading - bias, m/s^2; the reading is in the unit of the calibrated readings.",
+            base.frame(result),
         ]
         matrix = [value for row in base.rows(result.model.K_A * metres) for value in row]
         bias = base.rows(result.model.f_0 * metres)[0]

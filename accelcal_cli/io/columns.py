@@ -64,6 +64,8 @@ _ALONE = {
         r"(?:sensor|device|serial|imu|accelerometer|dut|node|board|chip|module|unit|part)"
         r"(?:id|no|nr|num|number|name|label|serial|serialno|serialnr|serialnumber|sn)|sensors?|device|serial|sn|imu|dut"
     ),
+    "instance": re.compile(r"(?:imu|sensor|acc|accel)?instance(?:id|no|nr|num|number)?"),
+    "kind": re.compile(r"(?:sensor|data|msg|message)?(?:type|kind)|topic|channel|measurement"),
     "other": re.compile(
         r"|t|time|timestamp|stamp|start|end|stop|tstart|tend|starttime|endtime|index|row|sec|seconds|id"
     ),
@@ -81,6 +83,7 @@ class Columns:
     Attributes:
         output: x, y, z; names: of these, or their numbers from 1.
         sensor, label: which sensor and which pose a row is of.
+        identity: columns whose values tell sensors apart, where no `sensor` is stated.
         count, scatter: raw readings behind a row, and the standard deviation of one of them.
         reference: known specific force; temperature, time, gyro: as their names say.
         notes: what a user should know.
@@ -96,6 +99,7 @@ class Columns:
     temperature: int | None = None
     time: int | None = None
     gyro: Triple | None = None
+    identity: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -111,7 +115,8 @@ class Columns:
     def selection(self) -> Selection:
         """Return what to ask of the table; a standard deviation or temperature may be missing in a row."""
         gaps = frozenset((*(self.scatter or ()), *_present(self.temperature)))
-        return Selection((*self.output, *self.extras), gaps, _present(self.sensor, self.label))
+        texts = (*_present(self.sensor, self.label), *self.identity)
+        return Selection((*self.output, *self.extras), gaps, texts)
 
     def split(self, extras: Float) -> tuple[Float | None, Float | None, Float]:
         """Split the values of `extras`, shape (B, k), into count (B,), scatter (B, 3) and the others (B, m)."""
@@ -144,6 +149,7 @@ class RawColumns:
     Attributes:
         output: the accelerometer; names: of its columns, or their numbers from 1.
         gyro, time: None where there are none.
+        identity: columns whose values tell sensors apart.
         dated: `time` holds dates, not numbers.
         guessed: `time` is only time when it never decreases.
         doubtful: the error when a guessed time column is not time, so that the others are unknown, too.
@@ -157,12 +163,15 @@ class RawColumns:
     dated: bool = False
     guessed: bool = False
     doubtful: str = ""
+    identity: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     def selection(self) -> Selection:
         """Return what to ask of the table: acceleration, gyroscope, time; dates as text."""
         sensors, time = (*self.output, *(self.gyro or ())), _present(self.time)
-        return Selection(sensors, texts=time) if self.dated else Selection((*sensors, *time))
+        if self.dated:
+            return Selection(sensors, texts=(*time, *self.identity))
+        return Selection((*sensors, *time), texts=self.identity)
 
 
 def choose(table: InputTable, wanted: Sequence[str] | None = None, sensor: int | None = None) -> Columns:
@@ -222,6 +231,27 @@ def choose_raw(
     if len(set(used)) < len(used):
         raise UsageError("--columns, --gyro, --time: a column is asked for twice")
     return replace(raw, gyro=turning, time=clock, dated=clock is not None and not table.numeric[clock])
+
+
+def restrict(table: InputTable, where: Sequence[str]) -> None:
+    """Let only those rows of a table be read that meet conditions, each as COLUMN=VALUE.
+
+    Raises:
+        UsageError: no condition, or no such column.
+    """
+    if not where:
+        return
+    from accelcal_cli.io.rows import Condition, RowFilter  # which itself knows columns
+
+    conditions = []
+    for text in where:
+        word, equals, value = text.partition("=")
+        if not (equals and word.strip() and value.strip()):
+            raise UsageError(f'--where "{text}": expected COLUMN=VALUE, as in device=0')
+        column = find_column(table, word.strip(), "--where")
+        name = str(column + 1) if table.names is None else table.names[column]
+        conditions.append(Condition(column, name, value.strip()))
+    table.filter = RowFilter(table.name, conditions)
 
 
 def sensor_column(table: InputTable, wanted: str | None = None) -> int:
@@ -369,6 +399,8 @@ def _only_three(table: InputTable, roles: Roles, sensor: int | None) -> Triple:
         *(roles.reference or ()),
         *roles.alone["other"],
         *roles.alone["sensor"],
+        *roles.alone["instance"],
+        *roles.alone["kind"],
         sensor,
         *(roles.first(role) for role in ("count", "temperature", "label")),
         *(column for triple in roles.scatter.values() for column in triple),
@@ -425,6 +457,7 @@ def _with_extras(
         free("temperature"),
         free("time"),
         free_triple(roles.gyro),
+        () if sensor is not None else _identity(roles, taken),
     )
     used = (*_present(sensor, columns.label), *columns.extras)
     if names is not None and used:
@@ -432,11 +465,23 @@ def _with_extras(
     return replace(columns, notes=(*notes, *roles.partial))
 
 
+def is_kind(name: str) -> bool:
+    """Return whether a column, by its name, holds kinds: of sensors perhaps, or of poses."""
+    return _role(name, "".join(tokens_of(name))) == "kind"
+
+
+def _identity(roles: Roles, taken: set[int | None]) -> tuple[int, ...]:
+    """Return the columns whose values tell sensors apart, as far as they are not otherwise used."""
+    columns = (column for role in ("sensor", "instance", "kind") for column in roles.alone[role])
+    return tuple(column for column in columns if column not in taken)
+
+
 def _by_name(table: InputTable, wanted: Sequence[str] | None) -> RawColumns:
     """Go by the names of the columns, or, for a stated accelerometer, by what the names leave."""
     columns = choose(table, wanted)
     if table.names is not None:
-        return RawColumns(columns.output, columns.names, columns.gyro, columns.time)
+        identity = columns.identity
+        return RawColumns(columns.output, columns.names, columns.gyro, columns.time, identity=identity)
     guess = 0 if 0 not in columns.output and table.numeric[0] else None
     return RawColumns(columns.output, columns.names, time=guess, guessed=True)
 
@@ -465,6 +510,8 @@ def _role(name: str, key: str) -> str | None:
     """Return the role of a single column, None for an axis and for an unknown name."""
     if _CAPITAL_T.fullmatch(name.strip()):
         return "temperature"
+    if name.strip() == "I":  # the instance, in the logs of ArduPilot
+        return "instance"
     return next((role for role, pattern in _ALONE.items() if pattern.fullmatch(key)), None)
 
 

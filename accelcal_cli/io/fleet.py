@@ -9,6 +9,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,18 +17,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_column
+from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import InputTable, RowBlock, open_table
-from accelcal_cli.io.readings import (
-    LOOKED_AT,
-    RAW_ROWS,
-    LabelledMeans,
-    Readings,
-    doubts,
-    log_warnings,
-    may_be_doubtful,
-    number_labels,
-)
+from accelcal_cli.io.readings import LabelledMeans, Readings, number_labels
+from accelcal_cli.io.rows import ZeroRows, add_stretches, places, zero_rows
+from accelcal_cli.io.screening import LOOKED_AT, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
 from accelcal_cli.notices import Notice
 
@@ -80,7 +74,6 @@ class Batch:
     Attributes:
         sensors: their numbers, shape (R,); count: poses of each, shape (R,).
         output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
-        doubtful: which sensors have cautions, or might have, shape (R,).
         behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
         scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise; cross: covariances xy, xz
             and yz of one, shape (R, J, 3), sensor units squared, likewise.
@@ -90,7 +83,6 @@ class Batch:
     count: Int
     output: Float
     pose: Int
-    doubtful: Bool
     behind: Float | None = None
     scatter: Float | None = None
     cross: Float | None = None
@@ -104,6 +96,7 @@ class FleetReadings:
         source: the file, or how many.
         sensors: their labels, in the order in which they came; poses: J of each, shape (R,).
         origins: the tables, in their order.
+        zeros: rows that were zero in all axes and were left out, by number of the sensor: how many, and which.
     """
 
     source: str
@@ -112,6 +105,7 @@ class FleetReadings:
     origins: tuple[TableOrigin, ...]
     _store: RowStore = field(repr=False)  # number of the sensor, output
     _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
+    zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     def origin(self, pose: int) -> TableOrigin:
         """Return the table that a pose came from, by its number among all."""
@@ -132,20 +126,32 @@ class FleetReadings:
             count=_known(batch.behind, at, count),
             scatter=_known(batch.scatter, at, count),
             cross=_known(batch.cross, at, count),
-        ).known_as(
-            origin.sha256,
-            origin.columns,
-            origin.notes,
-            lambda pose: self.where(int(poses[pose])),
-            self.warnings(batch, at),
-        )
+            warnings=self.warnings(batch, at),
+        ).known_as(origin.sha256, origin.columns, origin.notes, lambda pose: self.where(int(poses[pose])))
 
     def warnings(self, batch: Batch, at: int) -> tuple[Notice, ...]:
         """Return why the readings of the sensor at `at` in a batch may not be poses."""
-        origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
-        first, span = output[:LOOKED_AT], float(np.ptp(output, axis=0).max())
-        log = log_warnings(len(output), first, span, origin.name, timed=origin.timed) if origin.rows else ()
-        return (*log, *doubts(first, origin.columns))
+        count, poses, sensor = int(batch.count[at]), batch.pose[at], int(batch.sensors[at])
+        origin, first = self.origin(int(poses[0])), min(count, LOOKED_AT)
+        screened = Screened(
+            batch.output[at, :first],
+            origin.columns,
+            count,
+            lambda pose: self.where(int(poses[pose])),
+            origin.name,
+            single=origin.rows,
+            timed=origin.timed,
+            count=_known(batch.behind, at, first),
+            scatter=_known(batch.scatter, at, first),
+        )
+        return (*screened.notices(), *zero_rows(*self.zeros.get(sensor, (0, "")), count))
+
+    def doubtful(self, batch: Batch) -> Bool:
+        """Return which sensors of a batch may have warnings, shape (R,)."""
+        doubtful = needs_look(batch.output[:, :LOOKED_AT], batch.count)
+        if batch.scatter is not None:
+            doubtful |= (batch.scatter == 0).any(axis=(1, 2))
+        return np.asarray(doubtful | np.isin(batch.sensors, list(self.zeros)))
 
     def labelled(self, batch: Batch) -> Bool:
         """Return which sensors of a batch have poses that a label made, shape (R,)."""
@@ -180,7 +186,6 @@ class FleetReadings:
                 count,
                 output,
                 pose[at],
-                may_be_doubtful(output[:, :LOOKED_AT], count) | (count >= RAW_ROWS),
                 *(None if extras is None else extras[at][..., part] for part in EXTRAS),
             )
 
@@ -230,14 +235,17 @@ def read_fleet(
     sensor: str | None = None,
     *,
     stdin: BinaryIO | None = None,
+    where: Sequence[str] = (),
 ) -> FleetReadings:
     """Read the static readings of many sensors; ``-`` is standard input.
 
     One table has a column that labels the sensor, found by its name or named by `sensor`. Of several files each is
-    one sensor, named by its file, unless `sensor` names that column. `columns` are the three output columns.
+    one sensor, named by its file, unless `sensor` names that column. `columns` are the three output columns. Of the
+    rows only those are read that meet the conditions `where`, each as COLUMN=VALUE.
 
     Raises:
-        DataError: a fault of the input, with its place; UsageError: of `columns` or `sensor`, or a file twice.
+        DataError: a fault of the input, with its place.
+        UsageError: a fault of `columns`, `sensor` or `where`, or a file twice.
     """
     for k, source in enumerate(sources):
         if source in sources[:k]:
@@ -248,6 +256,7 @@ def read_fleet(
     for source, name in zip(sources, names, strict=True):
         table = open_table(source, stdin)
         try:
+            restrict(table, where)
             collector.read(table, columns, sensor, name)
         finally:
             table.close()
@@ -258,7 +267,8 @@ def read_fleet(
             "column labels the sensor)"
         )
     sensors, origins = tuple(collector.index), tuple(collector.origins)
-    return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras)
+    zeros = collector.zeros
+    return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras, zeros)
 
 
 def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
@@ -281,6 +291,7 @@ class _FleetCollector:
     store: RowStore = field(default_factory=lambda: RowStore(4))
     extras: RowStore | None = None
     origins: list[TableOrigin] = field(default_factory=list)
+    zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     def read(
         self, table: InputTable, wanted: Sequence[str] | None, sensor: str | None, name: str | None
@@ -293,32 +304,54 @@ class _FleetCollector:
             shown = columns.names[columns.output.index(column)]
             raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
         means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
+        zeros, idle = ZeroRows(), dict[int, list[int]]()
         for rows in table.blocks(columns.selection()):
             if not len(rows.numbers):
                 continue
             columns.check(table, rows)
             labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
             codes = number_labels(self.index, labels)
-            output, (count, scatter, _) = rows.numbers[:, :3], columns.split(rows.numbers[:, 3:])
+            keep = None if columns.reference is not None else zeros.keep(rows.numbers[:, :3], rows.start)
+            numbers, label = rows.numbers, rows.texts[columns.sensor is not None] if means is not None else ()
+            if keep is not None:
+                for row in np.flatnonzero(~keep).tolist():
+                    idle.setdefault(int(codes[row]), []).append(rows.start + row)
+                codes, numbers, label = codes[keep], numbers[keep], list(compress(label, keep.tolist()))
+            output, (count, scatter, _) = numbers[:, :3], columns.split(numbers[:, 3:])
+            if not len(output):
+                continue
             if means is None:
                 self._add(codes, output, count, scatter)
             else:
-                means.add(list(zip(codes.tolist(), rows.texts[-1], strict=True)), output, count, scatter)
+                means.add(list(zip(codes.tolist(), label, strict=True)), output, count, scatter)
         if means is not None:
             codes = np.array([code for code, _ in means.index], dtype=np.intp)
             self._add(codes, means.mean, means.count(), means.scatter(), means.cross())
+        self._note_zeros(idle, table.where)
+        place = _past_zeros(table.where, zeros) if zeros.count else table.where
         self.origins.append(
             TableOrigin(
                 table.name,
                 table.sha256,
                 columns.names,
                 first,
-                table.where if means is None else _by_label([label for _, label in means.index]),
+                place if means is None else _by_label([label for _, label in means.index]),
                 columns.notes if columns.temperature is None else (*columns.notes, COLD),
                 rows=means is None,
                 timed=columns.time is not None,
             )
         )
+
+    def _note_zeros(self, idle: dict[int, list[int]], where: Callable[[int], str]) -> None:
+        """Note the rows of zeros of each sensor; one that has nothing else keeps them."""
+        for code, rows in idle.items():
+            before, shown = self.zeros.get(code, (0, ""))
+            stretches: list[tuple[int, int]] = []
+            add_stretches(stretches, np.array(rows))
+            self.zeros[code] = before + len(rows), shown or places(stretches, where)
+            if code >= len(self.poses) or not self.poses[code]:
+                self._add(np.full(len(rows), code), np.zeros((len(rows), 3)), None, None)
+                del self.zeros[code]
 
     def _add(
         self,
@@ -353,6 +386,10 @@ def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> lis
             f'state --sensor-column "{shown}" to read every file that way'
         )
     return [name] * len(rows.numbers)
+
+
+def _past_zeros(where: Callable[[int], str], zeros: ZeroRows) -> Callable[[int], str]:
+    return lambda pose: where(zeros.rows.line(pose))
 
 
 def _by_label(labels: list[str]) -> Callable[[int], str]:

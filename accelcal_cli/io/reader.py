@@ -18,13 +18,15 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import BOM, Dialect, decode_line, is_blank, looks_numeric, sniff, split_cells
 from accelcal_cli.io.stream import ByteSource, open_source
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from accelcal_cli.io.rows import RowFilter
 
 LIMIT = 1e100
 """Largest reading: greater values cannot be squared safely."""
@@ -58,6 +60,9 @@ class RowBlock:
 
 class InputTable(Protocol):
     """A table that can be read once, from top to bottom."""
+
+    filter: RowFilter | None
+    """Which rows are read; all when None."""
 
     @property
     def name(self) -> str:
@@ -115,6 +120,7 @@ class TextTable:
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
         self.has_rows = bool(self.dialect.first)
+        self.filter: RowFilter | None = None
         self._source = source
         self._lines = LineMap()
 
@@ -129,20 +135,30 @@ class TextTable:
 
     def pairs(self, selection: Selection) -> Iterator[tuple[bytes, RowBlock]]:
         """Read blocks of whole lines, each with the selected columns of its rows."""
-        careful = CarefulParser(self.name, self.dialect, selection)
+        careful = CarefulParser(self.name, self.dialect, selection, self.filter)
         self._lines = careful.lines
         parse = careful.parse if self._source.whole else FastParser(careful).parse
         for block in self._source.blocks():
             top = _top(block, self.dialect.header_line) if careful.line == 0 else 0
-            if top:
-                yield block[:top], careful.parse(block[:top])
-            if top < len(block):
-                yield block[top:], parse(block[top:])
+            if top and (kept := self._filtered(block[:top], top=self.dialect.header_line > 0)):
+                yield kept, careful.parse(kept)
+            if top < len(block) and (kept := self._filtered(block[top:])):
+                yield kept, parse(kept)
+        if self.filter is not None:
+            self.filter.check()
+
+    def _filtered(self, block: bytes, *, top: bool = False) -> bytes:
+        if self.filter is None:
+            return block
+        return self.filter.keep_all(block) if top else self.filter.keep(block, self.dialect)
 
     @property
     def where(self) -> Callable[[int], str]:
         """Line of a row that has been read."""
-        return self._lines.where
+        if self.filter is None:
+            return self._lines.where
+        lines, kept = self._lines, self.filter.lines
+        return lambda row: f"line {kept.line(lines.line(row))}"
 
     def close(self) -> None:
         """Release the file."""
@@ -162,6 +178,15 @@ class LineMap:
             self.rows.append(row)
             self.lines.append(line)
 
+    def add_many(self, rows: Int, lines: Int) -> None:
+        """Note that each of some rows, ascending, is on its line."""
+        if not len(rows):
+            return
+        self.add(int(rows[0]), int(lines[0]))
+        breaks = np.flatnonzero(np.diff(lines - rows)) + 1
+        self.rows.frombytes(rows[breaks].astype(np.int64).tobytes())
+        self.lines.frombytes(lines[breaks].astype(np.int64).tobytes())
+
     def line(self, row: int) -> int:
         """Return the line number of a row."""
         k = bisect.bisect_right(self.rows, row) - 1
@@ -179,6 +204,7 @@ class CarefulParser:
     source: str  # named in messages
     dialect: Dialect
     selection: Selection
+    filter: RowFilter | None = None  # that the lines have passed
     lines: LineMap = field(default_factory=LineMap)
     row: int = 0  # rows so far
     line: int = 0  # lines so far
@@ -189,7 +215,7 @@ class CarefulParser:
         texts: tuple[list[str], ...] = tuple([] for _ in self.selection.texts)
         for raw in io.BytesIO(block):
             self.line += 1
-            line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self.line, self.source)
+            line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self._line(), self.source)
             if is_blank(line) or line.lstrip().startswith("#") or self.line == self.dialect.header_line:
                 continue
             cells = self._cells(line)
@@ -208,6 +234,10 @@ class CarefulParser:
         self.row += rows
         self.line += rows
         return start
+
+    def _line(self) -> int:
+        """Return the number of the line in the input."""
+        return self.line if self.filter is None else self.filter.lines.line(self.line)
 
     def _cells(self, line: str) -> list[str]:
         if line.count('"') % 2:
@@ -237,7 +267,7 @@ class CarefulParser:
 
     def _place(self, column: int | None = None) -> str:
         """Return where the parser is, for a message."""
-        here, names = f"{self.source}, line {self.line}", self.dialect.names
+        here, names = f"{self.source}, line {self._line()}", self.dialect.names
         if column is None:
             return here
         name = f'"{names[column]}"' if names is not None and names[column] else column + 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -100,5 +100,6 @@ def record(detection: Detection) -> dict[str, Any]:
             "candidates": [{key: getattr(one, key) for key in keys} for one in detection.candidates],
             "poses": poses_table(detection).records(),
             "notes": [*detection.notes, detection.summary()],
+            "warnings": [asdict(notice) for notice in detection.warnings],
         }
     )

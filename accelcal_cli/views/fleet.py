@@ -135,9 +135,7 @@ def _spread(fleet: Fleet, g: float) -> Table:
             row = np.quantile(values, QUANTILES).tolist()
             rows.append((name, *(format(v, spec) for v in row), unit))
     columns = ("quantity", "least", "5 %", "median", "95 %", "greatest", "unit")
-    note = (
-        "Scale factors, misalignments and biases in gauge lower, of the sensors that their poses determine."
-    )
+    note = "Scale factors, misalignments and biases of the engineering view, of the sensors that their poses determine."
     return Table("Fleet", tuple(Column(name) for name in columns), tuple(rows), (note,))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from accelcal_cli.calibration.distributions import Noise, Pair, combined, holm
+from accelcal_cli.calibration.distributions import Noise, Pair, combined, holm, student_quantile
 from accelcal_cli.calibration.observability import design
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
