@@ -33,10 +33,10 @@ MOST_TERMS = 2000
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it (0: not known)."""
+    """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it, whole or not (0: not known)."""
 
     variance: float
-    freedom: int
+    freedom: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +253,37 @@ def student_quantile(probability: float, freedom: float) -> float:
         if abs(step) <= 1e-13 * angle:
             break
     return math.sqrt(freedom) * math.tan(angle)
+
+
+MOST_STUDENT = 1e9
+"""Degrees of freedom from which on Student's t is the normal distribution to nine digits."""
+
+
+def student_freedom(probability: float, value: float) -> float:
+    """Return the degrees of freedom with which Student's t stays below a value with a probability.
+
+    The inverse of `student_quantile` in its other argument: at least 1, at most MOST_STUDENT.
+
+    Args:
+        probability: above 0.5; value: above the quantile of the normal distribution.
+    """
+    # The quantile is nearly straight in 1 / n: false position, its idle end halved.
+    ends = [1.0 / MOST_STUDENT, 1.0]
+    miss = [student_quantile(probability, 1.0 / x) - value for x in ends]
+    if miss[0] >= 0 or miss[1] <= 0:
+        return MOST_STUDENT if miss[0] >= 0 else 1.0
+    kept = 2
+    for _ in range(60):
+        x = ends[0] - miss[0] * (ends[1] - ends[0]) / (miss[1] - miss[0])
+        off = student_quantile(probability, 1.0 / x) - value
+        if abs(off) <= 1e-12 * value:
+            break
+        side = int(off > 0)
+        ends[side], miss[side] = x, off
+        if side == kept:
+            miss[1 - side] *= 0.5
+        kept = side
+    return 1.0 / x
 
 
 def _cosine_power(angle: Float, power: float) -> Float:

@@ -113,6 +113,8 @@ class Slopes:
         sensor: K, gauge `lower`, and D at the reference temperature, shapes (R, 3, 3) and (R, 3).
         rows: the design of the nine parameters without what the slopes take, and of the slopes, shape (R, J, 15).
         cofactor: of the slopes, shape (R, 6, 6).
+        part: what the slopes' columns hold of those of the nine, shape (6, 9).
+        units: of the slopes, per degree, in one m/s^2 at half the range of temperature, shape (6,).
     """
 
     temperature: Temperature
@@ -120,6 +122,19 @@ class Slopes:
     sensor: tuple[Float, Float]
     rows: Float
     cofactor: Float
+    part: Float
+    units: Float
+
+    def with_covariance(self, covariance: Float) -> Temperature:
+        """Return the slopes with their sigma and the covariance of all fifteen, from that which belongs to `rows`.
+
+        `covariance`: of the nine parameters and of slopes + part @ nine, (m/s^2)^2, shape (15, 15).
+        """
+        back = np.eye(9 + SLOPES)
+        back[9:, :9] = -self.part
+        joint = back @ covariance @ back.T
+        scale, bias = np.split(np.sqrt(np.diagonal(joint)[9:]) * self.units, 2)
+        return replace(self.temperature, covariance=joint, sigma_scale=scale, sigma_bias=bias)
 
 
 @dataclass(frozen=True, eq=False)

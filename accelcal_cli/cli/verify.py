@@ -15,6 +15,7 @@ in_test = options.panel("Test")
 
 
 def command(
+    *,
     result: options.ResultFile,
     data: Annotated[
         str,
@@ -24,6 +25,11 @@ def command(
     ],
     columns: options.Columns = None,
     where: options.Where = None,
+    raw: Annotated[
+        bool,
+        options.in_log("--raw", help="The file is a raw log: find its static poses first, as detect does."),
+    ] = False,
+    log: options.DetectionOptions,
     g: Annotated[
         float | None,
         options.in_input(help="Local gravity; must be that of the result.", show_default="the result's"),
@@ -46,10 +52,11 @@ def command(
     that --tolerance was missed.
     """
     from accelcal_cli.io.readings import read_readings
-    from accelcal_cli.verification import verify
+    from accelcal_cli.verification.verify import verify
     from accelcal_cli.views.verification import blocks, differences
 
     options.check_input(data)
+    log.check_raw(raw)
     if not 0 < level < 1:
         raise UsageError(f"--level {level:g}: expected a chance between 0 and 1")
     old = options.load_result(result, data)
@@ -57,7 +64,12 @@ def command(
         raise UsageError(
             f"--g {g:g}: {result} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
         )
-    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ())
+    if raw:
+        readings = log.poses(data, columns, where, old.g, misalignment=not old.held.any())
+    else:
+        readings = read_readings(
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()
+        )
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():
         options.print_result(
