@@ -23,7 +23,7 @@ from accelcal_cli.calibration.observability import (
     PoseVerdict,
     poses_to_add,
 )
-from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, pattern_chance
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
@@ -77,6 +77,9 @@ an interval from 95 to 94 %."""
 
 LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
 """Residuals of at most this part of the noise that the scatter predicts, and by chance this rarely, are told of."""
+
+SURELY_PATTERN = 5e-4
+"""Chance of a pattern in the residuals below which it is told of."""
 
 CHECKABLE, FEW_TO_CHECK = 0.9, 3
 """Leverage up to which a pose is checked by the others, and the degrees of freedom up to which that is asked: beyond
@@ -133,9 +136,11 @@ def assess(fit: Fit) -> Assessment:
             suggestions[at], reasons[at] = _advice(fit, at, unchecked[at])
     outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
-    left = _to_gain(fit)
-    for at in np.flatnonzero(_may_have_warnings(fit, left)).tolist():
-        warnings[at] = _warnings(fit, at, float(left[at]), outliers[at])
+    left, (bent, drift) = _to_gain(fit), _patterns(fit)
+    patterned = (bent < SURELY_PATTERN) | (drift < SURELY_PATTERN)
+    for at in np.flatnonzero(_may_have_warnings(fit, left) | patterned).tolist():
+        own = _patterns_in_words(float(bent[at]), float(drift[at]))
+        warnings[at] = (*_warnings(fit, at, float(left[at]), outliers[at]), *own)
     verdicts = [_verdict(word, said) for word, said in zip(geometry, warnings, strict=True)]
     return Assessment(fit, verdicts, reasons, suggestions, warnings, outliers)
 
@@ -257,6 +262,37 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
     always |= settings.nominal is not None or _trembling(fit)
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
+
+
+def _patterns(fit: Fit) -> tuple[Float, Float]:
+    """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
+
+    A quadratic and a cubic term of each axis; a bias that changes evenly from the first pose to the last.
+    """
+    residuals, sample = fit.residuals, fit.sample
+    poses = int(sample.poses.max())
+    if fit.solution is None or residuals.pose.shape[1] < poses or fit.solution.slopes is not None:
+        return np.full(len(sample), np.nan), np.full(len(sample), np.nan)
+    weights = fit.solution.robust_weights()
+    w = residuals.real.astype(float) if weights is None else weights
+    u = residuals.force / np.maximum(np.linalg.norm(residuals.force, axis=2, keepdims=True), 1e-300)
+    time = (residuals.pose / np.maximum(sample.poses[:, None] - 1, 1))[..., None]
+    bent = pattern_chance(residuals, w, np.concatenate([u**3, u**4], axis=2), fit.settings.g)
+    return bent, pattern_chance(residuals, w, time * u, fit.settings.g)
+
+
+def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:
+    """Return warnings of patterns in the residuals, by their p-values."""
+    notices = []
+    if drift < SURELY_PATTERN:
+        text = f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
+        remedy = "Let the sensor warm up first, or add a column of temperatures."
+        notices.append(Notice("residuals", "warning", text, remedy))
+    if bent < SURELY_PATTERN:
+        text = f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
+        remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
+        notices.append(Notice("residuals", "warning", text, remedy))
+    return tuple(notices)
 
 
 def _trembling(fit: Fit) -> bool:

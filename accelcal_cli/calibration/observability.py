@@ -339,7 +339,9 @@ def engineering_chain(lower: Float, D: Float, g: float) -> Float:
             cosine = np.sum(rows[..., i, :] * rows[..., j, :], axis=-1)
             turn = -(rows[..., i, a] * rows[..., j, b] + rows[..., i, b] * rows[..., j, a]) / g
             turn -= cosine * (scale[..., i] + scale[..., j])
-            with np.errstate(divide="ignore", invalid="ignore"):  # two axes that are one have no angle to turn
+            with np.errstate(
+                divide="ignore", invalid="ignore"
+            ):  # two axes that are one have no angle to turn
                 change[..., 3 + q, p] = turn / np.sqrt(1.0 - cosine**2)
         change[..., 6:, p] = -D / s * scale
     for i in range(3):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.distributions import student_chance
+from accelcal_cli.calibration.distributions import f_chance, student_chance
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design
 from accelcal_cli.calibration.sample import NO_NOISE, Sample
 
@@ -28,6 +28,9 @@ OUTLIER_LEVEL = 0.002
 STEPS, SETTLED = 12, 1e-6
 """Gauss-Newton steps at most of a fit without a pose, and the part of g below which a step is the last: the next would
 be its square."""
+
+OPEN_DIRECTION = 1e-8
+"""Part of the largest eigenvalue below which the poses do not tell a pattern from the parameters."""
 
 LEAST_ROOM = 1e-8
 """The trace of a matrix times that of its inverse is below 1 over this where the other poses determine a sensor."""
@@ -190,6 +193,37 @@ def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
     poses, freedom = (np.broadcast_to(a, size.shape)[suspect] for a in (poses, freedom))
     beyond[suspect] = poses * student_chance(size[suspect], freedom - 1) < OUTLIER_LEVEL
     return beyond
+
+
+FEWEST_SPARE = 3
+"""Degrees of freedom that a test for a pattern leaves to the noise at least."""
+
+
+def pattern_chance(residuals: PoseResiduals, w: Float, columns: Float, g: float) -> Float:
+    """Return the p-values of a pattern in the residuals, shape (R,), NaN where the poses cannot tell.
+
+    The F test of a fit with q columns more: those of an error that the linear, constant model does not have.
+
+    Args:
+        residuals: of all poses; w: their weights, shape (R, J); columns: of the pattern, shape (R, J, q); g: m/s^2.
+    """
+    f = residuals.force
+    length = np.linalg.norm(f, axis=2, keepdims=True)
+    rows = np.concatenate([design(f / np.where(length > 0, length, 1.0)), columns], axis=2)
+    e = (g * g - np.sum(f * f, axis=2)) / (2.0 * g)
+    normal = (rows * w[..., None]).swapaxes(1, 2) @ rows
+    values, vectors = np.linalg.eigh(normal)
+    known = values > OPEN_DIRECTION * values[:, -1:]
+    part = (vectors.swapaxes(1, 2) @ ((rows * (w * e)[..., None]).sum(axis=1))[..., None])[..., 0]
+    gain = np.sum(np.where(known, part**2 / np.where(known, values, 1.0), 0.0), axis=1)
+    total = np.sum(w * e * e, axis=1)
+    spare = np.count_nonzero(w, axis=1) - rows.shape[2]
+    told = known.all(axis=1) & (spare >= FEWEST_SPARE) & (total > (NO_NOISE * g) ** 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = (gain / columns.shape[2]) / (np.maximum(total - gain, 0.0) / spare)
+    x = np.where(told, np.clip(ratio, 1e-12, 1e12), 1.0)
+    freedom = np.where(told, spare, 1).astype(float)
+    return np.where(told, f_chance(x, np.full(len(x), float(columns.shape[2])), freedom), np.nan)
 
 
 def leave_out(
