@@ -268,9 +268,7 @@ class Screened:
             f"poses have to be found first; {label}"
         )
         place = {"<stdin>": "-", "<array>": "LOG"}.get(self.source, shlex.quote(self.source))
-        yield Notice(
-            "log", "warning", f"{text} with moves in it; {label}", f"{COMMAND}calibrate {place} --raw"
-        )
+        yield Notice("log", "warning", text, f"{COMMAND}calibrate {place} --raw")
 
     def _dead_axes(self) -> Iterator[Notice]:
         output, names = self.output, self.names
@@ -464,7 +462,8 @@ class Rails:
             return 1.0
         equal, near = _ties_elsewhere(output, tied, self.screened.surface)
         tie = min(1.0, max(float(self.screened.tie.max()) * near, equal, RARE))
-        ends = min(1.0, max(tie, float(self.screened.steps.max()) / (SCALE_SPREAD * abs(tied[0][1]))))
+        spread = max(SCALE_SPREAD * abs(tied[0][1]), 1e-300)
+        ends = min(1.0, max(tie, float(self.screened.steps.max()) / spread))
         chance = 1.0
         if len(output) >= FEWEST:
             chance = math.comb(6, sides) * ends ** (sides - 1) * tie ** (number - sides)
