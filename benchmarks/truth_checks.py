@@ -169,7 +169,14 @@ def spoiled(
     error, _, _ = deviations(result, without.model)
     _, _, sigma = deviations(without, without.model)
     moved = float(np.max(np.abs(error) / sigma)) if len(error) == len(sigma) else float("inf")
-    return moved, set(hit.tolist()) <= set(result.outliers), result.verdict
+    return moved, _are_named(hit, output, result), result.verdict
+
+
+def _are_named(hit: Int, output: Float, result: Calibration) -> bool:
+    """Whether a result names some poses: as outliers, or as rows of zeros, which are left out before it."""
+    if not output[hit].any():
+        return any(notice.key == "zero-rows" for notice in result.warnings)
+    return set(hit.tolist()) <= set(result.outliers)
 
 
 def factor(value: float, number: int = 1) -> Callable[[Scene, Float], Int | None]:

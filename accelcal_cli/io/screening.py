@@ -36,9 +36,13 @@ RAW_ROWS = 500
 ALIKE = 0.05
 """Most rows of a log differ from the one before by less than this part of the range."""
 
-BLOCK, CREEP, MOVING = 8, 6.0, 0.02
+BLOCK, CREEP, MOVING = 8, 6.0, 0.01
 """Rows are in a move where means of BLOCK of them step by CREEP times what the quieter ones do; a log has MOVING of
 its rows in moves."""
+
+ONWARD, JUMP = 2.2, 8.0
+"""Rows move all the time where means of BLOCK of them get further than ONWARD in four steps, in parts of one, and few
+rows jump, by JUMP times the usual."""
 
 MANY_COPIES, SOME_COPIES = 1 / 3, 0.1
 """Parts of the poses from which on copies matter: where readings without noise may repeat, and where they cannot."""
@@ -51,6 +55,9 @@ FIXED = 0.02
 
 FITTED = 1024
 """Poses at most that the quadric is fitted to."""
+
+MOST_PARTS = 65
+"""The least difference of two readings is looked for a resolution in fewer parts than this."""
 
 ONE_POINT = 0.05
 """A range of the readings below this part of their size is less than 3 degrees: the sensor was not turned."""
@@ -132,18 +139,21 @@ def _terms(output: Float) -> Float | None:
     return np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, np.ones_like(x)], axis=1)
 
 
-def grid_step(values: Float) -> float:
-    """Return the step of which all differences of some values are multiples, 0 where there is none."""
-    values = np.unique(values)
-    if len(values) < 3:
-        return float(values[-1] - values[0]) if len(values) == 2 else 0.0
-    gaps = np.diff(values)
-    least = float(gaps[gaps > 1e-12 * float(values[-1] - values[0])].min())
-    for step in (*(least / k for k in range(1, 13)), *(10.0**-k for k in range(9))):
-        parts = gaps / step
-        if (np.abs(parts - np.round(parts)) < 0.02).all() and (len(gaps) > 5 or step < least):
+def grid_step(*axes: Float) -> float:
+    """Return the step of which all differences of values within an axis are multiples, 0 where there is none."""
+    values = [np.unique(axis) for axis in axes]
+    gaps = np.concatenate([np.diff(axis) for axis in values])
+    if len(gaps) < 2:
+        return float(gaps.sum())
+    least = float(gaps[gaps > 1e-12 * max(float(np.ptp(axis)) for axis in values)].min())
+    for step in (*(least / k for k in range(1, MOST_PARTS)), *(10.0**-k for k in range(9))):
+        if all(_are_whole(part / step) for part in (gaps[:32], gaps)) and (len(gaps) > 5 or step < least):
             return step
     return 0.0
+
+
+def _are_whole(numbers: Float) -> bool:
+    return bool((np.abs(numbers - np.round(numbers)) < 0.02).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,18 +196,21 @@ class Screened:
 
     @cached_property
     def steps(self) -> Float:
-        """Resolution of each axis, shape (3,), 0 where none shows."""
-        return np.array([grid_step(axis) for axis in self.output[:LOOKED_AT].T])
+        """Resolution of each axis, shape (3,), 0 where none shows: its own, or the one of all where that is coarser."""
+        return np.maximum(grid_step(*self.output.T), [grid_step(axis) for axis in self.output.T])
 
     @cached_property
     def tie(self) -> Float:
-        """Chance that two poses of one attitude read the same on an axis, shape (3,): 1 without noise."""
+        """Chance that two poses of one attitude read the same on an axis, shape (3,): 1 without noise.
+
+        Rounding to a step is in the noise that the poses show: where that is below the step, it may be all of it.
+        """
         if self.surface is None:
             return np.ones(3)
         step = np.maximum(self.steps, 1e-12 * np.abs(self.output).max(axis=0))
         noise = np.maximum(self.surface.noise, 1e-300)
         # The difference of two normal readings has a density of 1 / (2 sqrt(pi) sigma) at zero.
-        return np.asarray(np.minimum(1.0, step / (2 * math.sqrt(math.pi) * noise)))
+        return np.where(noise < step, 1.0, np.minimum(1.0, step / (2 * math.sqrt(math.pi) * noise)))
 
     @cached_property
     def copies(self) -> int:
@@ -255,9 +268,7 @@ class Screened:
             f"poses have to be found first; {label}"
         )
         place = {"<stdin>": "-", "<array>": "LOG"}.get(self.source, shlex.quote(self.source))
-        yield Notice(
-            "log", "warning", f"{text} with moves in it; {label}", f"{COMMAND}calibrate {place} --raw"
-        )
+        yield Notice("log", "warning", text, f"{COMMAND}calibrate {place} --raw")
 
     def _dead_axes(self) -> Iterator[Notice]:
         output, names = self.output, self.names
@@ -347,18 +358,30 @@ class Screened:
 
 
 def _has_moves(output: Float) -> bool:
-    """Return whether rows, shape (J, 3), pass through moves: means of BLOCK rows that creep for three steps or more.
+    """Return whether rows, shape (J, 3), pass through moves: means of BLOCK rows that creep for two steps or more.
 
-    A jump from pose to pose, without rows between, is in two steps at most.
+    A jump from pose to pose, without rows between, is one row's step; noise that follows itself does not get further
+    in four blocks than a random walk, which comes to twice the step of one.
     """
     blocks = len(output) // BLOCK
     means = output[: blocks * BLOCK].reshape(blocks, BLOCK, 3).mean(axis=1)
-    steps = np.abs(np.diff(means, axis=0)).max(axis=1)
-    if np.median(steps) > np.median(np.abs(np.diff(output, axis=0)).max(axis=1)):
-        return True  # it moves all the time: means of noise would differ by less than rows do
+    row = np.abs(np.diff(output, axis=0)).max(axis=1)
+    steps, largest = _block_steps(means, row, 1)
+    far, within = _block_steps(means, row, 4)
+    smooth = within < JUMP * float(np.median(row))
+    if smooth.mean() > 0.5 and np.median(far[smooth]) > ONWARD * max(np.median(steps), np.median(row)):
+        return True  # it moves all the time
     span = float(np.ptp(output, axis=0).max())
-    moving = steps > max(CREEP * float(np.quantile(steps, 0.25)), 1e-3 * span)
-    return bool((moving[2:] & moving[1:-1] & moving[:-2]).mean() > MOVING)
+    moving = steps > np.maximum(largest, max(CREEP * float(np.quantile(steps, 0.25)), 1e-3 * span))
+    return bool((moving[1:] & moving[:-1]).mean() > MOVING)
+
+
+def _block_steps(means: Float, row: Float, blocks: int) -> tuple[Float, Float]:
+    """Return how far means of BLOCK rows are from those so many blocks on, and the largest step of a row between."""
+    steps = np.abs(means[blocks:] - means[:-blocks]).max(axis=1)
+    width = BLOCK * (blocks + 1) - 1
+    windows = np.lib.stride_tricks.sliding_window_view(row, width)[::BLOCK]
+    return steps, windows.max(axis=1)[: len(steps)]
 
 
 def _fit_apart(output: Float, part: Bool) -> bool:
@@ -430,13 +453,20 @@ class Rails:
         return list(groups.values())
 
     def _chance(self, output: Float, tied: list[tuple[int, float, int]]) -> float:
-        """Return about how often honest poses would meet these extremes so many times."""
+        """Return about how often honest poses would meet these extremes so many times.
+
+        Poses of one side meet by their noise; the ends of two sides meet by scale factors and biases, which are alike.
+        """
         number, sides = sum(m for _, _, m in tied), len(tied)
         if number < 2:
             return 1.0
         equal, near = _ties_elsewhere(output, tied, self.screened.surface)
-        tie = max(float(self.screened.tie.max()) * near, equal, RARE)
-        chance = 6 * tie ** (number - 1) if len(output) >= FEWEST else 1.0
+        tie = min(1.0, max(float(self.screened.tie.max()) * near, equal, RARE))
+        spread = max(SCALE_SPREAD * abs(tied[0][1]), 1e-300)
+        ends = min(1.0, max(tie, float(self.screened.steps.max()) / spread))
+        chance = 1.0
+        if len(output) >= FEWEST:
+            chance = math.comb(6, sides) * ends ** (sides - 1) * tie ** (number - sides)
         bits = [bits_of_rail(value) for _, value, _ in tied]
         whole = bool((output == np.round(output)).all())
         if (

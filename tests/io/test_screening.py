@@ -75,6 +75,17 @@ def test_honest_readings_raise_no_alarm(capsys):
     assert len(alarms) <= 0.002 * sets + 1
 
 
+@pytest.mark.parametrize("step", [16.0, 1000 / 256, 1000 / 1024, 1000 / 4096])
+def test_a_coarse_resolution_explains_copies_and_equal_extremes(step):
+    """Poses held twice read the same, and ends of two axes meet, where steps are no finer than the noise."""
+    rng, alarms = np.random.default_rng(15), []
+    for _ in range(50):
+        for name in ("turns", "fibonacci", "icosahedron", "edges twice"):
+            for mg in (0.02, 0.2):
+                alarms += keys(quantized(output(rng, attitudes(name, rng), "g", mg), "g", step))
+    assert len(alarms) <= 1
+
+
 def test_readings_without_noise_are_not_clipped():
     rng = np.random.default_rng(12)
     for name in ("edges", "turns", "faces-edges", "edges twice"):
@@ -182,6 +193,32 @@ def test_a_log_is_told_from_poses_with_many_rows():
     moved += rng.normal(0, 0.02, moved.shape)
     assert "log" in keys(moved)
     assert "log" in keys(still, timed=True)
+
+
+def correlated(rng, rows, rho):
+    """Noise whose rows follow each other, shape (rows, 3)."""
+    noise = rng.normal(size=(rows, 3)) * np.sqrt(1 - rho**2)
+    for k in range(1, rows):
+        noise[k] += rho * noise[k - 1]
+    return noise
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9, 0.99])
+@pytest.mark.parametrize("hold", [3, 8, 16, 18, 20, 25, 30, 60])
+def test_holds_of_any_length_and_noise_are_no_log(hold, rho):
+    rng = np.random.default_rng(16)
+    for mg in (0.2, 20.0):
+        u = np.repeat(held(directions(200, "fibonacci", np.empty((0, 3))), rng), hold, axis=0)
+        rows = output(rng, u[:4000], mg=0.0)
+        assert "log" not in keys(rows + mg * 1e-3 * G * correlated(rng, len(rows), rho))
+
+
+@pytest.mark.parametrize("period", [100, 300, 1000])
+def test_a_sensor_that_turns_all_the_time_is_a_log(period):
+    rng, t = np.random.default_rng(17), np.arange(2000.0)[:, None] / period
+    u = np.sin(2 * np.pi * t * [1.0, 0.7, 1.3] + [0.0, 1.6, 1.0])
+    for mg in (0.2, 2.0):
+        assert "log" in keys(output(rng, u / np.linalg.norm(u, axis=1)[:, None], mg=mg))
 
 
 def test_rows_of_zeros_are_no_poses(tmp_path):

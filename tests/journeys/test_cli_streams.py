@@ -162,11 +162,10 @@ def test_readings_are_not_awaited_from_a_terminal(environment, tmp_path):
 
 def numbers(result):
     """Return the numbers of a result as its tables show them."""
-    for row, sigmas, bias, sigma in zip(
-        result["K_a"], result["sigma"]["K_a"], result["D_a"], result["sigma"]["D_a"], strict=True
-    ):
+    half = result["interval"]
+    for row, widths, bias, width in zip(result["K_a"], half["K_a"], result["D_a"], half["D_a"], strict=True):
         yield from (f"{value:.8g}" for value in (*row, bias))
-        yield from (f"{value:.2g}" for value in (*sigmas, sigma))
+        yield from (f"{value:.2g}" for value in (*widths, width))
     yield from (f"{dop:.3f}" for dop in result["dop"]["parameters"].values())
     yield from (f"{result[name]:.6g}" for name in ("rms", "rms_before", "s"))
     yield f"{result['cost']:.9g}"

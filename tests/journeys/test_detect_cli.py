@@ -231,7 +231,7 @@ def broken(kind):
         ("nan", 'bad.csv, line 43, column "ay": "nan" is not a finite number'),
         ("back", "bad.csv, line 1502: time 12 comes after 14.99"),
         ("equal", "bad.csv: all readings are equal"),
-        ("one pose", "bad.csv: 1 still pose in 1 attitude, fewer than 12"),
+        ("one pose", "bad.csv: the sensor was never turned: all readings show one attitude"),
     ],
 )
 @pytest.mark.parametrize("command", [("detect",), ("calibrate", "--raw")])

@@ -174,7 +174,9 @@ def test_lost_sensors_are_named_and_the_others_calibrated(run, table):
     done = run("fleet", "lost.csv", "-q")
     assert done.code == 1
     assert done.err == "accelcal: 2 of 20 sensors undetermined or failed: S09, S04\n"
-    assert done.out.startswith("20 sensors: 18 good, 1 undetermined, 1 failed\n")
+    assert done.out.startswith(
+        "20 sensors: 18 good, 1 undetermined, 1 failed, 1 of them with a note or a warning\n"
+    )
     assert "all 3 poses are equal" in done.out
     rows = rows_of(run("fleet", "lost.csv", "--format", "csv", "-q").out)
     whole = rows_of(run("fleet", table, "--format", "csv", "-q").out)

@@ -29,7 +29,9 @@ def test_twelve_poses_from_nothing(run):
 
 def test_six_poses_more_than_the_faces(run, faces):
     done = run("plan", faces, "--noise", "0.01", "--format", "json")
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err.startswith("accelcal: six.csv: warning: The readings have 6 different attitudes")
+    assert done.err.count("\n") == 1
     record = json.loads(done.out)
     assert [row["pose"] for row in record["poses"]] == list(range(6, 13))
     assert record["poses"][0]["dop_misalignment"] is None
@@ -138,7 +140,7 @@ def test_faces_alone_exit_with_1(run):
         (("nowhere.csv",), "nowhere.csv"),
         (("nowhere.yaml",), "nowhere.yaml"),
         (("six.csv", "--columns", "a,b,c"), "six.csv"),
-        (("r.yaml", "--g", "9.8"), "leave out --columns, --g and --latitude"),
+        (("r.yaml", "--g", "9.8"), "leave out --columns, --where, --g and --latitude"),
         (("bad.yaml",), "bad.yaml"),
         (("--format", "xml"), '--format "xml": unknown'),
     ],

@@ -125,7 +125,7 @@ def test_readings_that_determine_no_sensor_are_refused():
     u = np.repeat(np.array([[1.0, 0, 0], [0, 0.6, 0.8], [-0.6, 0.8, 0]]), 8, axis=0)
     rows = G * u + 1e-3 * np.random.default_rng(1).normal(size=u.shape)
     with pytest.raises(
-        DataError, match=r"no unique least cost .* undetermined \(The poses do not determine: "
+        DataError, match=r"no unique least cost .* undetermined \(The 24 poses have 3 different"
     ):
         Recording.of(Readings.from_array(rows), G)
 
