@@ -109,7 +109,7 @@ class Columns:
     def selection(self) -> Selection:
         """Return what to ask of the table; a standard deviation or temperature may be missing in a row."""
         gaps = frozenset((*(self.scatter or ()), *_present(self.temperature)))
-        return Selection((*self.output, *self.extras), gaps, _present(self.sensor, self.label))
+        return Selection((*self.output, *self.extras), gaps, _present(self.sensor, self.label), self.output)
 
     def split(self, extras: Float) -> tuple[Float | None, Float | None, Float]:
         """Split the values of `extras`, shape (B, k), into count (B,), scatter (B, 3) and the others (B, m)."""
@@ -143,7 +143,10 @@ class RawColumns:
     def selection(self) -> Selection:
         """Return what to ask of the table: acceleration, gyroscope, time; dates as text."""
         sensors, time = (*self.output, *(self.gyro or ())), _present(self.time)
-        return Selection(sensors, texts=time) if self.dated else Selection((*sensors, *time))
+        needed = self.output
+        if self.dated:
+            return Selection(sensors, texts=time, needed=needed)
+        return Selection((*sensors, *time), needed=needed)
 
 
 def choose(table: InputTable, wanted: Sequence[str] | None = None, sensor: int | None = None) -> Columns:

@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.preamble import Facts
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
@@ -20,11 +21,19 @@ from accelcal_cli.io.stream import BackgroundThread, ByteSource
 ROWS = 500_000
 """Rows of a block."""
 
+PREVIEW = 2000
+"""Rows that the columns are told by where their names do not."""
+
 
 class ParquetTable:
     """A Parquet file, streamed a batch of rows at a time."""
 
     has_rows: bool
+    units: tuple[str, ...] | None = None
+    facts = Facts()
+    source_format = "parquet"
+    notes: tuple[str, ...] = ()
+    rows_skipped = 0
 
     def __init__(self, source: ByteSource, path: Path | None) -> None:
         """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
@@ -51,6 +60,12 @@ class ParquetTable:
         """SHA-256 of the file."""
         self._hashing.wait()
         return self._source.sha256
+
+    def preview(self) -> list[list[str]]:
+        """Return the cells of the first rows."""
+        with _named_errors(self.name):
+            frame = pl.scan_parquet(self._path).head(PREVIEW).collect()
+        return [["" if cell is None else str(cell) for cell in row] for row in frame.iter_rows()]
 
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns."""

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import LIMIT, InputTable, RowBlock, open_table
+from accelcal_cli.io.reader import LIMIT, PLAIN, InputTable, ReadOptions, RowBlock, open_table
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 
 STUCK = 1_000_000
@@ -154,22 +154,27 @@ class Readings:
 
 
 def read_readings(
-    source: str | Path, columns: Sequence[str] | None = None, *, stdin: BinaryIO | None = None
+    source: str | Path,
+    columns: Sequence[str] | None = None,
+    *,
+    stdin: BinaryIO | None = None,
+    options: ReadOptions = PLAIN,
 ) -> Readings:
     """Read static readings from a text table or a Parquet file; ``-`` is standard input.
 
-    `columns` names the three output columns, or numbers them from 1; without it their names decide.
-    Rows that share a position label are averaged.
+    `columns` names the three output columns, or numbers them from 1; without it their names decide. `options` say what
+    the user knows of the form of a text. Rows that share a position label are averaged.
 
     Raises:
         DataError: a fault of the input, with its place. UsageError: a fault of `columns`.
     """
-    table = open_table(source, stdin)
+    table = open_table(source, stdin, options=options)
     try:
         collector = Collector(table.name, choose(table, columns))
         for rows in table.blocks(collector.columns.selection()):
             check_rows(table, collector.columns, rows)
             collector.add(rows)
+        collector.notes[:0] = table.notes
         return collector.readings(table.sha256, table.where)
     finally:
         table.close()
