@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.detection.rawlog import UNITS, Clock, RawLog
+from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.errors import UsageError
+from accelcal_cli.io.clock import UNITS, Clock
 from accelcal_cli.io.stream import RowStore
 
 IN_MEMORY = 1_000_000
@@ -145,8 +146,11 @@ class Spans:
 
 
 def longest_step(clock: Clock, lengths: RowLengths) -> float:
-    """Return the longest step of the time column that is no gap, in its unit: a window, and LATE periods at least."""
-    return math.inf if clock.period is None else max(lengths.window, LATE) * clock.period
+    """Return the longest step of the time column that is no gap, in its unit: a window, and LATE periods at least.
+
+    Where rows come in bursts, or times are rounded, a pause of the usual length comes on top.
+    """
+    return math.inf if clock.period is None else max(lengths.window, LATE) * clock.period + clock.pause
 
 
 class Gaps:

@@ -22,6 +22,9 @@ Group = dict[str, tuple[list[int], list[int], list[int]]]
 
 AXES = "xyz"
 
+COUNTED = 16
+"""Digits from which on a time is read as an integer: a 64-bit float would round it."""
+
 NONE = "none"
 """Option value for no gyroscope, or no time."""
 
@@ -205,7 +208,15 @@ def choose_raw(
     used = (*raw.output, *(turning or ()), *_present(clock))
     if len(set(used)) < len(used):
         raise UsageError("--columns, --gyro, --time: a column is asked for twice")
-    return replace(raw, gyro=turning, time=clock, dated=clock is not None and not table.numeric[clock])
+    return replace(raw, gyro=turning, time=clock, dated=clock is not None and _is_text(table, clock))
+
+
+def _is_text(table: InputTable, clock: int) -> bool:
+    """Return whether a time column has to be read as text: dates, clocks, and counts too long for a float."""
+    if not table.numeric[clock]:
+        return True
+    first = next((cells[clock] for cells in table.preview() if cells[clock]), "")
+    return first.isascii() and first.isdigit() and len(first) >= COUNTED
 
 
 def sensor_column(table: InputTable, wanted: str | None = None) -> int:
