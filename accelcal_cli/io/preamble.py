@@ -48,6 +48,10 @@ LAYOUTS: dict[tuple[str, int], tuple[str, ...]] = {
 """Names of the columns of devices that write none: by a word of the preamble and the width of the table."""
 
 
+DEVICE_UNITS = {"ActiGraph": "g", "GENEActiv": "g", "Axivity": "g", "AX3": "g"}
+"""Units of acceleration of devices that do not write it, by a word of the preamble."""
+
+
 @dataclass(frozen=True)
 class Facts:
     """What stands above a table, as far as it was understood.
@@ -55,7 +59,7 @@ class Facts:
     Attributes:
         rate: rows per second, Hz; start, serial, range: as written.
         day_first: whether dates begin with the day, None where nothing says.
-        device: key of LAYOUTS, "" where there is none.
+        device: key of LAYOUTS, "" where there is none; unit: of the acceleration that it writes, None if unknown.
     """
 
     rate: float | None = None
@@ -64,6 +68,7 @@ class Facts:
     range: str = ""
     day_first: bool | None = None
     device: str = ""
+    unit: str | None = None
 
     def __str__(self) -> str:
         """What was understood, in words."""
@@ -130,6 +135,7 @@ def read_facts(lines: Sequence[str]) -> Facts:
         span[1].strip() if span else "",
         None if order is None else order[1].lower().startswith("d"),
         next((device for device, _ in LAYOUTS if device.lower() in text.lower()), ""),
+        next((unit for device, unit in DEVICE_UNITS.items() if device.lower() in text.lower()), None),
     )
 
 

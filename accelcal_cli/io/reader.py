@@ -61,11 +61,13 @@ class ReadOptions:
         skip_rows: lines at its beginning that are not looked at.
         skip_bad: leave out rows that cannot be read, up to MOST_BAD of them.
         line: what the lines of readings begin with, among lines of several kinds; None to find them by their words.
+        count: the column of counts, or ``none``; None to find it by its name.
     """
 
     skip_rows: int = 0
     skip_bad: bool = False
     line: str | None = None
+    count: str | None = None
 
 
 PLAIN = ReadOptions()

@@ -170,7 +170,7 @@ def read_readings(
     """
     table = open_table(source, stdin, options=options)
     try:
-        collector = Collector(table.name, choose(table, columns))
+        collector = Collector(table.name, choose(table, columns, count=options.count))
         for rows in table.blocks(collector.columns.selection()):
             check_rows(table, collector.columns, rows)
             collector.add(rows)

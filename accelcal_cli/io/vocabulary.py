@@ -20,7 +20,7 @@ Quantity = Literal[
 
 AXES = "xyz"
 
-_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]*\s*$")
+_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]")
 _ALL_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
 _INDEX = re.compile(r"\[([012])\]\s*$")  # accelerometer_m_s2[0]
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
@@ -163,7 +163,7 @@ _TAIL = frozenset(
     }
 )
 _TIME_WORDS = re.compile(
-    r"(?:t|time|timestamp|timestamps|stamp|sec|seconds|zeit|zeitstempel|temps|horodatage|date|datetime|datum|millis|"
+    r"(?:t|time|timestamp|timestamps|stamp|sec|seconds|zeit|zeitstempel|temps|horodatage|utc|date|datetime|datum|millis|"
     r"micros|epoch|epoc|unix|elapsed|uptime|clock|uhrzeit|heure|tow|datenum)+(?:ns|us|usec|ms|msec|s|utc|local|unix|"
     r"cal|fine|sincestart|sincereboot|ofday)*(?:unix|cal|instant)*"
 )
@@ -197,9 +197,9 @@ def parse_unit(text: str) -> str | None:
 
 def name_unit(name: str) -> str | None:
     """Return the unit in the name of a column, ``g`` for ``ax_g`` and ``gFx``; None where there is none."""
-    brackets = _BRACKETS.search(name)
-    if brackets and (unit := parse_unit(brackets[1])):
-        return unit
+    for text in reversed(_BRACKETS.findall(name)):
+        if unit := parse_unit(text):
+            return unit
     bare = plain(_INDEX.sub("", name))
     if re.search(r"_?m_s_?2(?:_|$)", bare):
         return "m/s^2"
@@ -242,7 +242,11 @@ def tokens_of(name: str) -> list[str]:
     """Return the words of a column name in lower case, without units and without "mean"."""
     name = _INDEX.sub(lambda match: "_" + AXES[int(match[1])], re.sub(r"_?m_s_?2", "", plain(name)))
     words = re.findall(r"[a-z0-9]+", _CAMEL.sub("_", _ALL_BRACKETS.sub(" ", name)).lower())
-    while len(words) > 1 and _UNIT_WORDS.fullmatch(words[-1]):
+    while (
+        len(words) > 1
+        and _UNIT_WORDS.fullmatch(words[-1])
+        and (words[-1] != "2" or words[-2] in ("s", "ms", "m"))
+    ):
         words.pop()
     if len(words) == 1 and (glued := re.fullmatch(r"(?:mean|avg)([xyz])", words[0])):
         return [glued[1]]
@@ -264,9 +268,11 @@ def is_time(name: str) -> bool:
         "gps",
         "device",
     ):
-        words = words[1:]
+        words = (
+            words[2:] if words[1:] and words[1].isalnum() and any(map(str.isdigit, words[1])) else words[1:]
+        )
     key = "".join(words)
-    return bool(_TIME_WORDS.fullmatch(key)) or parse_unit(name) in ("s", "ms", "us", "ns")
+    return bool(_TIME_WORDS.fullmatch(key))
 
 
 def is_temperature(name: str) -> bool:
@@ -282,7 +288,9 @@ def describe(name: str) -> Meaning:
     at, axis, number = _axis_word(words)
     if at is None:
         return Meaning(_quantity(words), "".join(words))
-    stem = re.sub(r"^[xyz]out$|[xyz0-9]+$", "", words[at]) if words[at] not in AXES else ""
+    stem = (
+        re.sub(r"^[xyz](?=acc|gyr|mag)|^[xyz]\w+$|[xyz0-9]+$", "", words[at]) if words[at] not in AXES else ""
+    )
     rest = [*words[:at], *([stem] if stem else []), *words[at + 1 :]]
     return Meaning(_quantity(rest) or _STEMS.get(rest[-1] if rest else ""), "".join(rest), axis, number)
 
@@ -293,7 +301,9 @@ def _axis_word(words: Sequence[str]) -> tuple[int | None, int | None, int | None
         if words[at] in AXES:
             return at, AXES.index(words[at]), None
     for at in reversed(range(len(words))):
-        if match := re.fullmatch(r"([xyz])(?:out|axis|ch|acc\w*|val)|(?:[a-z]*?)([xyz])", words[at]):
+        if match := re.fullmatch(
+            r"([xyz])(?:out|axis|ch|acc\w*|gyr\w*|mag\w*|val)|(?:[a-z]*?)([xyz])", words[at]
+        ):
             letter = match[1] or match[2]
             if match[1] or len(words[at]) <= 3 or _quantity([words[at][:-1]]):
                 return at, AXES.index(letter), None
