@@ -172,11 +172,11 @@ def _find_output(table: InputTable, roles: Roles, sensor: int | None) -> tuple[T
                 name: one for name, one in families.items() if unit_of_output(table, one) in FORCE_UNITS
             }
             return _only_family(table, roles, stated if len(stated) == 1 else families), []
-    stated = {name: one for name, one in roles.unknown.items() if unit_of_output(table, one) in FORCE_UNITS}
-    if len(stated) == 1:
-        output = next(iter(stated.values()))
+    by_unit = [k for k in _left(table, roles, sensor) if unit_of_output(table, (k, k, k)) in FORCE_UNITS]
+    if len(by_unit) == 3 and names is not None and table.facts.unit is None:
+        output = _in_order(names, by_unit)
         return output, [
-            f"columns {listed(names or (), output)} taken as x, y, z: their unit is that of acceleration"
+            f"columns {listed(names, output)} taken as x, y, z: their unit is that of acceleration"
         ]
     left = _left(table, roles, sensor)
     if len(left) == 3 or names is None or len(left) < 3:

@@ -81,7 +81,6 @@ UNITS: dict[str, tuple[Quantity, tuple[str, ...]]] = {
                 "none",
                 "nounit",
                 "unitless",
-                "1",
                 "cal",
                 "uncal",
                 "v",
