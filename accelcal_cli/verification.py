@@ -34,11 +34,12 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.notices import Notice, are_serious
 from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
-SCHEMA = "accelcal/verification/1"
+SCHEMA = "accelcal/verification/2"
 
 FARTHEST = (0.3, 0.3, 1.0)
 """Half-widths of the box for the new parameters: scale factors (part), misalignments (rad), biases (parts of g)."""
@@ -99,7 +100,7 @@ class Verification:
 
     Attributes:
         verdict: unchanged, changed or inconclusive; `reasons` says why in sentences.
-        cautions: what speaks against the new readings, in sentences.
+        warnings: what speaks against the new readings.
         chance: that an unchanged sensor looks as different; level: below it the sensor has changed.
         chi_square: d^T C^-1 d of the determined directions; directions: how many, at most nine; chance_together:
             of so large a chi-square when nothing changed.
@@ -113,7 +114,7 @@ class Verification:
 
     verdict: str
     reasons: tuple[str, ...]
-    cautions: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     chance: float
     level: float
     chi_square: float
@@ -185,7 +186,7 @@ def verify(
             *(limitations if verdict == "inconclusive" else ()),
             *notes,
         ),
-        cautions=_cautions(old, shift, tests.pair, readings, verdict),
+        warnings=_warnings(old, shift, tests.pair, readings, verdict),
         chance=tests.chance,
         level=level,
         chi_square=tests.chi_square,
@@ -390,7 +391,7 @@ def _verdict(chance: float, level: float, limitations: tuple[str, ...], readings
     A chance that is no number, for readings that determine no direction, says nothing.
     """
     if limitations or np.isnan(chance):
-        certain = chance < min(level, SURELY) and not readings.cautions
+        certain = chance < min(level, SURELY) and not are_serious(readings.warnings)
         return "changed" if certain else "inconclusive"
     return "changed" if chance < level else "unchanged"
 
@@ -424,8 +425,8 @@ def limitations_of(old: Calibration, pair: Pair, readings: Readings) -> tuple[st
     variance = pair.b.variance
     noisier = variance > NOISIER**2 * pair.a.variance and pair.noise_chance() < SURELY
     lines = {
-        "The new readings themselves are doubtful, as the cautions say, so the differences say little about the "
-        "sensor.": bool(readings.cautions),
+        "The new readings themselves are doubtful, as the warnings say, so the differences say little about the "
+        "sensor.": are_serious(readings.warnings),
         f"A typical pose of the result itself is off by {old.s / old.g:.2%} of g, which hides any ordinary change. "
         "Calibrate again first.": is_large(old.s, old.g, old.freedom),
         "The noise of the new readings hides changes that the result would show. Measure again as carefully as for "
@@ -435,10 +436,10 @@ def limitations_of(old: Calibration, pair: Pair, readings: Readings) -> tuple[st
     return tuple(line for line, holds in lines.items() if holds)
 
 
-def _cautions(
+def _warnings(
     old: Calibration, shift: Shift, pair: Pair, readings: Readings, verdict: str
-) -> tuple[str, ...]:
-    """Return what speaks against the new readings, in sentences, as `calibrate` would say it of them.
+) -> tuple[Notice, ...]:
+    """Return what speaks against the new readings, as `calibrate` would say it of them.
 
     Few poses hide the one among them that is wrong: where the verdict is inconclusive the result helps to find it.
     """
@@ -447,7 +448,7 @@ def _cautions(
     if verdict == "inconclusive":
         outlier |= _outliers_of_result(old, readings)
     names = [readings.where(j) for j in np.flatnonzero(outlier).tolist()]
-    return (*readings.cautions, *large_residuals(s, old.g, freedom), *not_fitting(names, freedom))
+    return (*readings.warnings, *large_residuals(s, old.g, freedom), *not_fitting(names, freedom))
 
 
 def _outliers(shift: Shift, pair: Pair, readings: Readings, g: float) -> Bool:

@@ -65,7 +65,7 @@ def test_a_calibration_loads_nothing_heavy():
         f"print([name for name in {layers.HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT.parent)
-    assert 0 < json.loads(done.stdout)["noise_chance"] < 1
+    assert 0 < json.loads(done.stdout)["residual_noise_p"] < 1
     assert done.stderr.splitlines()[-1] == "[]"
 
 

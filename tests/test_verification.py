@@ -132,7 +132,7 @@ def test_much_more_noise_tells_nothing(times, told):
         for line in found.reasons
     )
     assert not any(d.changed for d in found.differences)
-    assert any("of g (above 0.5%" in line for line in found.cautions) == (times > 5)
+    assert any("of g (above 0.5%" in line.text for line in found.warnings) == (times > 5)
 
 
 def test_a_change_that_noise_does_not_hide_is_one():
@@ -144,7 +144,7 @@ def test_a_change_that_noise_does_not_hide_is_one():
 
 def test_a_result_of_large_residuals_shows_nothing_unchanged():
     old = calibrate(readings(TURNS, model=MEMS, sigma=0.5, seed=1), FAST)
-    assert old.verdict == "good"
+    assert old.verdict == "suspect"
     found = verify(old, new())
     assert found.verdict == "inconclusive"
     assert any(line.startswith("A typical pose of the result itself is off by 4.") for line in found.reasons)
@@ -161,7 +161,7 @@ def test_rows_of_a_log_are_no_poses():
     assert found.chance < 1e-9
     assert found.verdict == "inconclusive"
     assert any("themselves are doubtful" in line for line in found.reasons)
-    assert "6,000 rows are a log" in found.cautions[0]
+    assert "6,000 rows are a log" in found.warnings[0].text
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,10 @@ def test_a_pose_that_is_wrong_is_named(u):
     output[3] *= 1.1
     found = verify(result(), Readings.from_array(output))
     assert found.verdict == "inconclusive"
-    assert found.cautions[-1] == "Outlier: pose 4 does not fit the other poses (p < 0.01). Measure it again."
+    assert (
+        str(found.warnings[-1])
+        == "Outlier: pose 4 does not fit the other poses (p < 0.01). Measure it again."
+    )
 
 
 def test_a_pose_that_is_a_little_wrong_is_named_beside_the_verdict():
@@ -181,10 +184,10 @@ def test_a_pose_that_is_a_little_wrong_is_named_beside_the_verdict():
     output[3] *= 1.002
     found = verify(result(), Readings.from_array(output, labels=[f"p{k}" for k in range(24)]))
     assert found.verdict == "unchanged"
-    assert found.cautions == (
+    assert [str(notice) for notice in found.warnings] == [
         'Outlier: position "p3" does not fit the other poses (p < 0.01). Measure it again.',
-    )
-    assert verify(result(), new()).cautions == ()
+    ]
+    assert verify(result(), new()).warnings == ()
 
 
 def test_readings_without_noise_are_no_change():
@@ -218,9 +221,9 @@ def test_a_result_without_uncertainty_is_refused(u):
 def test_the_record_is_plain_and_the_tables_hold_it():
     found = verify(result(), new(poses.faces()), tolerance=0.01)
     record = json.loads(json.dumps(found.record(), allow_nan=False))
-    assert record["schema"] == "accelcal/verification/1"
+    assert record["schema"] == "accelcal/verification/2"
     assert record["differences"][3]["value"] is None
-    assert record["cautions"] == []
+    assert record["warnings"] == []
     assert record["result"]["sha256"] != record["data"]["sha256"]
     assert len(differences(found).rows) == 9
     assert ("tolerance", "0.01", "m/s^2") in evidence(found).rows
@@ -311,9 +314,9 @@ def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
 
 
 def test_copies_are_no_new_readings_and_are_not_called_a_log():
-    """Six poses, each four times to the last digit: the reason speaks of what the cautions say, not of a log."""
+    """Six poses, each four times to the last digit: the reason speaks of what the warnings say, not of a log."""
     output = np.repeat(new(poses.edges()[:6]).output(), 4, axis=0)
     found = verify(result(), Readings.from_array(output))
     assert found.verdict == "inconclusive"
-    assert any("themselves are doubtful, as the cautions say" in reason for reason in found.reasons)
-    assert any("repeat another to the last digit" in caution for caution in found.cautions)
+    assert any("themselves are doubtful, as the warnings say" in reason for reason in found.reasons)
+    assert any("repeat another to the last digit" in notice.text for notice in found.warnings)

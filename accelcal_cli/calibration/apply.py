@@ -22,6 +22,7 @@ from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.columns import Columns, choose
 from accelcal_cli.io.reader import InputTable, Selection, TextTable
 from accelcal_cli.io.rewrite import Change, rewrite
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES
 
@@ -91,14 +92,12 @@ class Correction:
         scaled = force if self.factor == 1.0 else force * self.factor
         return scaled if self.tilt is None else np.concatenate([scaled, self.tilt.columns(force)], axis=1)
 
-    def cautions(self) -> tuple[str, ...]:
-        """Return what the first readings say against the result, in sentences, once they have come."""
+    def warnings(self) -> tuple[Notice, ...]:
+        """Return what the first readings say against the result, once they have come."""
         if self.first is None or USUAL[0] <= self.first <= USUAL[1]:
             return ()
-        return (
-            f"The first readings come out as {self.first:.3g} g (median): are they in the unit of those that were "
-            "calibrated?",
-        )
+        text = f"The first readings come out as {self.first:.3g} g (median), not 1 g."
+        return (Notice("unit", "warning", text, "Give them in the unit of those that were calibrated."),)
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,24 @@
-"""What is said of a fit: verdict, reasons, poses to add, and cautions of what speaks against the readings.
+"""What is said of a fit: verdict, reasons, poses to add, and warnings of what speaks against the numbers.
 
-The verdict is of the poses: how an error of one reading comes out in the parameters. Cautions are of the readings and
-of the search: they do not change the verdict, and stand beside it. Arrays tell which sensors need words at all.
+Reasons are of the poses: how an error of one reading comes out in the parameters. Warnings are of the readings, the
+fit and the search. The verdict is of the calibration, of both together. Arrays tell which sensors need words at all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.distributions import chi_square_chance
 from accelcal_cli.calibration.fit import Fit
-from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Verdict, poses_to_add
+from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Geometry, poses_to_add
+from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.search import rounding
+from accelcal_cli.notices import Notice, Severity, are_serious
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -24,7 +27,7 @@ MORE_THAN_NOISE, SURELY = 2.0, 1e-3
 """Residuals this many times their noise, and by chance this rarely, are told of."""
 
 MOST_NAMED = 8
-"""Poses that one caution names."""
+"""Poses that one warning names."""
 
 FEW = 6
 """Degrees of freedom up to which poses stand in for each other: of twelve edges, which leave three, opposite ones."""
@@ -33,10 +36,23 @@ LARGE = 0.005
 """A noise of one pose above this part of g is told of. Data sheets of MEMS accelerometers state nonlinearities of up to
 0.5 % of full scale, and the real recordings of the tests leave 0.01 to 0.04 %."""
 
-PERPENDICULAR = (
+PERPENDICULAR = Notice(
+    "perpendicular",
+    "note",
     "The axes were taken as perpendicular, so no misalignment was estimated: one of 10 mrad, usual in low-cost "
-    "sensors, moves 1 % of the force along one axis to another."
+    "sensors, moves 1 % of the force along one axis to another.",
+    "Take twelve poses or more and estimate it, where that is too much.",
 )
+
+WALLED = Notice(
+    "box",
+    "warning",
+    "The search may not leave its box, so the parameters are not those that fit the readings best.",
+    "Widen the box or state the nominal sensor (--config, keys box and nominal).",
+)
+
+Loss = Literal["plain", "robust", "known"]
+"""What poses that do not fit were fitted with; see `not_fitting`."""
 
 STOPPED_SHORT = 0.01
 """Part of the cost that one more step would take off, from which on a search is told to be unfinished."""
@@ -56,9 +72,9 @@ class Assessment:
 
     Attributes:
         fit: what it is said of.
-        verdicts: good, weak or undetermined, R of them; reasons: why one is not good, in sentences.
+        verdicts: good, weak, suspect or undetermined, R of them; reasons: what the poses leave open, in sentences.
         suggestions: poses to add, in words.
-        cautions: what speaks against the readings or the search, in sentences, the gravest first.
+        warnings: what speaks against the readings, the fit or the search, the gravest first.
         outliers: numbers of the poses beyond chance, from 0.
     """
 
@@ -66,40 +82,46 @@ class Assessment:
     verdicts: list[Verdict]
     reasons: list[tuple[str, ...]]
     suggestions: list[tuple[str, ...]]
-    cautions: list[tuple[str, ...]]
+    warnings: list[tuple[Notice, ...]]
     outliers: list[tuple[int, ...]]
 
 
 def assess(fit: Fit) -> Assessment:
     """Assess a fit."""
     walled: list[bool] = np.asarray(fit.at_wall.any(axis=1)).tolist()
-    verdicts = [
-        _final_verdict(verdict, wall, freedom)
+    geometry = [
+        _geometry(verdict, wall, freedom)
         for verdict, wall, freedom in zip(
             fit.observability.verdicts, walled, fit.freedom.tolist(), strict=True
         )
     ]
-    reasons: list[tuple[str, ...]] = [()] * len(verdicts)
+    reasons: list[tuple[str, ...]] = [()] * len(geometry)
     suggestions = list(reasons)
-    for at, verdict in enumerate(verdicts):
-        if verdict != "good":
+    for at, word in enumerate(geometry):
+        if word != "good":
             suggestions[at], reasons[at] = _advice(fit, at)
     pose, outlier = fit.residuals.pose, fit.residuals.outlier
-    outliers: list[tuple[int, ...]] = [()] * len(verdicts)
+    outliers: list[tuple[int, ...]] = [()] * len(geometry)
     for at in np.flatnonzero(outlier.any(axis=1)).tolist():
         outliers[at] = tuple(pose[at, outlier[at]].tolist())
-    cautions: list[tuple[str, ...]] = [()] * len(verdicts)
+    warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
     left = _to_gain(fit)
-    for at in np.flatnonzero(_may_have_cautions(fit, left)).tolist():
-        cautions[at] = _cautions(fit, at, float(left[at]), outliers[at])
-    return Assessment(fit, verdicts, reasons, suggestions, cautions, outliers)
+    for at in np.flatnonzero(_may_have_warnings(fit, left)).tolist():
+        warnings[at] = _warnings(fit, at, float(left[at]), outliers[at])
+    verdicts = [_verdict(word, said) for word, said in zip(geometry, warnings, strict=True)]
+    return Assessment(fit, verdicts, reasons, suggestions, warnings, outliers)
 
 
-def _final_verdict(poses: Verdict, walled: bool, freedom: int) -> Verdict:
-    """Return the verdict of the poses, lowered where the search or the count of poses does not bear it out."""
+def _geometry(poses: Geometry, walled: bool, freedom: int) -> Geometry:
+    """Return the word on the poses, lowered where the search or their count does not bear it out."""
     if walled:
         return "undetermined"
     return "weak" if freedom == 0 and poses == "good" else poses
+
+
+def _verdict(geometry: Geometry, warnings: Sequence[Notice]) -> Verdict:
+    """Return the verdict on the calibration: `suspect` iff a warning stands and the poses determine it."""
+    return "suspect" if geometry != "undetermined" and are_serious(warnings) else geometry
 
 
 def _advice(fit: Fit, at: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -121,10 +143,7 @@ def _advice(fit: Fit, at: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
         )
     beyond = ", ".join(edge_names(fit.at_wall[at]))
     if beyond and view.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
-        lines.append(
-            f"The least cost lies outside the search box, beyond {beyond}: "
-            "widen the box or state the nominal sensor (--config, keys box and nominal)."
-        )
+        lines.append(f"The least cost lies outside the search box, beyond {beyond}.")
     return suggestions, tuple(lines)
 
 
@@ -153,31 +172,34 @@ def _scale_sigma(fit: Fit) -> Float:
     return np.asarray(np.sqrt(np.einsum("rpp->rp", fit.covariance)[:, SCALE]).max(axis=1) / fit.settings.g)
 
 
-def _may_have_cautions(fit: Fit, left: Float) -> Bool:
-    """Return which sensors `_cautions` has something to say of, or might have, shape (R,)."""
+def _may_have_warnings(fit: Fit, left: Float) -> Bool:
+    """Return which sensors `_warnings` has something to say of, or might have, shape (R,)."""
     g, s, settings = fit.settings.g, fit.s, fit.settings
     noisy = (s > LARGE * g) | (NOISE_BIAS * (s / g) ** 2 > _scale_sigma(fit))
     noisy |= fit.noise[0] >= MORE_THAN_NOISE
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
+    searched |= fit.at_wall.any(axis=1)
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
 
-def _cautions(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the cautions of a sensor, in sentences, the gravest first."""
+def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[Notice, ...]:
+    """Return what is said of a sensor, the gravest first."""
     readings, settings = fit.sample.readings(at), fit.settings
     s, freedom = float(fit.s[at]), int(fit.freedom[at])
     where = [readings.where(pose) for pose in outliers]
-    least_squares = settings.robust == "none" and fit.solution is not None
+    loss: Loss = "known" if fit.solution is None else "plain" if settings.robust == "none" else "robust"
     lines = [
-        *readings.cautions,
-        *not_fitting(where, freedom, robust=least_squares),
+        *readings.warnings,
+        *not_fitting(where, freedom, loss),
         *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
     ]
     if fit.solution is None:
         return (*lines, *_turned_round(fit.K[at]))
+    walled = bool(fit.at_wall[at].any()) and fit.view[at].verdict != "undetermined"
     return (
         *lines,
+        *((WALLED,) if walled else ()),
         *more_than_noise(*fit.noise[:, at].tolist()),
         *_noise_bias(s, settings.g, float(_scale_sigma(fit)[at])),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
@@ -194,8 +216,8 @@ def is_large(s: float, g: float, freedom: int) -> bool:
     return bool(chi_square_chance(np.array([x]), np.array([freedom]))[0] < SURELY)
 
 
-def large_residuals(s: float, g: float, freedom: int, *, aligned: bool = False) -> tuple[str, ...]:
-    """Return a caution of residuals that are large beside g.
+def large_residuals(s: float, g: float, freedom: int, *, aligned: bool = False) -> tuple[Notice, ...]:
+    """Return a warning of residuals that are large beside g.
 
     Args:
         s: standard deviation of one pose's modulus, in the unit of g, NaN where nothing tells it.
@@ -205,19 +227,23 @@ def large_residuals(s: float, g: float, freedom: int, *, aligned: bool = False) 
     if not is_large(s, g, freedom):
         return ()
     other = ", or the axes are not perpendicular" if aligned else ""
-    return (
+    text = (
         f"Residuals are too large: a typical pose is off by {s / g:.2%} of g (above {LARGE:.1%} is suspicious). Either "
-        "the sensor moved, too few readings were averaged, or the rows are not static poses" + other + ".",
+        f"the sensor moved, too few readings were averaged, or the rows are not static poses{other}."
+    )
+    return (
+        Notice("residuals", "warning", text, "Measure each pose again at rest, and average its readings."),
     )
 
 
-def not_fitting(outliers: Sequence[str], freedom: int, *, robust: bool = False) -> tuple[str, ...]:
-    """Return a caution that names the poses that do not fit, and what to do.
+def not_fitting(outliers: Sequence[str], freedom: int, loss: Loss = "known") -> tuple[Notice, ...]:
+    """Return a notice that names the poses that do not fit: a warning unless a robust loss has rejected them.
 
     Args:
         outliers: the poses, by line or label.
         freedom: degrees of freedom: with few, a sound pose can take the blame of another.
-        robust: whether a robust loss is a way out.
+        loss: `plain` least squares, to which a robust loss is a way out; a `robust` one; or `known` attitudes or
+            parameters, which know no other.
     """
     if not outliers:
         return ()
@@ -226,21 +252,26 @@ def not_fitting(outliers: Sequence[str], freedom: int, *, robust: bool = False) 
         named += f" and {len(outliers) - MOST_NAMED:,} more"
     one = len(outliers) == 1
     subject = f"Outlier: {named} does" if one else f"Outliers: {named} do"
-    again = f"Measure {'it' if one else 'them'} again" + (" or add --robust huber" if robust else "")
+    them = "it" if one else "them"
+    severity: Severity = "note" if loss == "robust" else "warning"
+    remedy = f"Measure {them} again{' or add --robust huber' if loss == 'plain' else ''}."
     blame = freedom <= FEW and not one
     doubt = " With so few poses one can take the blame of another." if blame else ""
-    return (f"{subject} not fit the other poses (p < 0.01). {again}.{doubt}",)
+    rejected = f" The robust loss counts {them} little." if loss == "robust" else ""
+    text = f"{subject} not fit the other poses (p < 0.01).{doubt}{rejected}"
+    return (Notice("outliers", severity, text, remedy),)
 
 
-def more_than_noise(ratio: float, chance: float) -> tuple[str, ...]:
-    """Return a caution of residuals of so many times the noise that the scatter predicts, and its p-value."""
+def more_than_noise(ratio: float, chance: float) -> tuple[Notice, ...]:
+    """Return a warning of residuals of so many times the noise that the scatter predicts, and its p-value."""
     if not (ratio >= MORE_THAN_NOISE and chance <= SURELY):
         return ()
-    return (
+    text = (
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
-        "moved in them, changed its temperature or is not linear. Sigma counts that as noise; the verdict is of the "
-        "poses alone.",
+        "moved in them, changed its temperature or is not linear. Sigma counts that as noise."
     )
+    remedy = "Let the sensor warm up, fix it in each pose, or add a column of temperatures."
+    return (Notice("residuals", "warning", text, remedy),)
 
 
 def ratio_in_words(ratio: float) -> str:
@@ -248,44 +279,48 @@ def ratio_in_words(ratio: float) -> str:
     return f"{ratio:.2g}" if ratio < 100 else f"{ratio:,.0f}"
 
 
-def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[str, ...]:
+def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[Notice, ...]:
     bias = NOISE_BIAS * (s / g) ** 2
     if not bias > sigma_scale:
         return ()
-    return (
-        f"The noise of one reading, {s:.3g}, makes the scale factors about {bias:.1%} too large, more than their "
-        "sigma. Average the readings of each pose first (a column that labels the pose).",
-    )
+    text = f"The noise of one reading, {s:.3g}, makes the scale factors about {bias:.1%} too large, above their sigma."
+    remedy = "Average the readings of each pose first (a column that labels the pose)."
+    return (Notice("noise-bias", "warning", text, remedy),)
 
 
-def _unfinished(agreeing: int, runs: int, left: float) -> tuple[str, ...]:
-    lines = []
+def _unfinished(agreeing: int, runs: int, left: float) -> tuple[Notice, ...]:
+    notices = []
     if left > STOPPED_SHORT:
-        lines.append(
-            f"The search stopped short of the minimum: one more step would take {left:.0%} off the cost. "
-            "Leave out --no-polish, or search longer."
-        )
+        short = f"The search stopped short of the minimum: one more step would take {left:.0%} off the cost."
+        remedy = "Leave out --no-polish, or search longer."
+        notices.append(Notice("unfinished-search", "warning", short, remedy))
     if agreeing < runs:
-        lines.append(f"{agreeing} of {runs} searches ended in the best minimum.")
-    return tuple(lines)
+        text = f"{agreeing} of {runs} searches ended in the best minimum."
+        remedy = "Search longer (--population, --iterations), or state the nominal sensor (--config)."
+        notices.append(Notice("unfinished-search", "note", text, remedy))
+    return tuple(notices)
 
 
-def odd_gravity(g: float) -> tuple[str, ...]:
-    """Return a caution of a gravity, m/s^2 or 1 for units of g, that is not found on Earth."""
+def odd_gravity(g: float) -> tuple[Notice, ...]:
+    """Return a warning of a gravity, m/s^2 or 1 for units of g, that is not found on Earth."""
     if g == 1.0 or EARTH[0] <= g <= EARTH[1]:
         return ()
-    return (
+    text = (
         f"g = {g:g} is neither gravity on Earth, {EARTH[0]} to {EARTH[1]} m/s^2, nor 1, for readings in units of g: "
-        "scale factors are proportional to it.",
+        "scale factors are proportional to it."
+    )
+    return (
+        Notice("wrong-gravity", "warning", text, "State yours with --g, or with --latitude and --height."),
     )
 
 
-def _turned_round(K: Float) -> tuple[str, ...]:
-    """Return a caution of a sensor whose axes all point to the other end of their own, K of shape (3, 3)."""
+def _turned_round(K: Float) -> tuple[Notice, ...]:
+    """Return a note of a sensor whose axes all point to the other end of their own, K of shape (3, 3)."""
     sizes = np.sqrt(np.diagonal(K @ K.T))
     if not (np.diagonal(K) < -0.5 * sizes).all():
         return ()
-    return (
+    text = (
         "All scale factors are negative: the reference, or the sensor, counts gravity instead of specific force, which "
-        "at rest points up.",
+        "at rest points up."
     )
+    return (Notice("negative-axes", "note", text, "Turn the sign of the reference (columns fx, fy, fz)."),)

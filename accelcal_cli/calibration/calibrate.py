@@ -13,7 +13,7 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.sample import NEEDS, Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
@@ -110,8 +110,7 @@ def faults(sample: Sample, settings: Settings) -> list[str]:
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
     fit = assessment.fit
-    settings, search, readings = fit.settings, fit.search, fit.sample.readings(at)
-    model = ErrorModel(fit.K[at], fit.D[at])
+    settings, search, model = fit.settings, fit.search, ErrorModel(fit.K[at], fit.D[at])
     ratio, chance = (None if np.isnan(v) else v for v in fit.noise[:, at].tolist())
     return Calibration(
         K_a=model.K,
@@ -120,11 +119,12 @@ def record(assessment: Assessment, at: int) -> Calibration:
         f_0=model.f_0,
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
+        interval=NO_INTERVAL,
         dop=Dop.of(fit.dop[at]),
         verdict=assessment.verdicts[at],
         reasons=assessment.reasons[at],
         suggestions=assessment.suggestions[at],
-        cautions=assessment.cautions[at],
+        warnings=assessment.warnings[at],
         cost_search=float(search.cost[at]),
         cost=float(fit.value[at]),
         rms=float(fit.rms[at]),
@@ -132,13 +132,14 @@ def record(assessment: Assessment, at: int) -> Calibration:
         before=fit.before[at],
         s=float(fit.s[at]),
         freedom=int(fit.freedom[at]),
-        noise_ratio=ratio,
-        noise_chance=chance,
+        residual_noise_ratio=ratio,
+        residual_noise_p=chance,
         covariance=fit.covariance[at],
         information=fit.information[at],
         nominal_scale=np.array(fit.nominal[at]),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=int(fit.sample.poses[at]),
+        attitudes=fit.attitudes[at],
         evaluations=int(search.evaluations[at]),
         runs=search.runs,
         runs_agreeing=int(search.agreeing[at]),
@@ -148,11 +149,15 @@ def record(assessment: Assessment, at: int) -> Calibration:
         optimizer=search.optimizer,
         settings=_settings_record(assessment, at),
         g=settings.g,
-        data={"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)},
+        data=_origin(fit.sample.readings(at)),
         notes=_notes(assessment, at),
         version=__version__,
         temperature=fit.temperature,
-    )
+    ).with_intervals(float(fit.coverage[at]))
+
+
+def _origin(readings: Readings) -> dict[str, object]:
+    return {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
 
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:

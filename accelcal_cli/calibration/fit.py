@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
+from accelcal_cli.calibration.distributions import chi_square_chance, student_chance, student_quantile
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     ROWS_COLUMNS,
+    Geometry,
     Observability,
-    Verdict,
     design,
     propagate,
 )
@@ -42,6 +43,9 @@ OUTLIER_LEVEL = 0.01
 
 EDGE = 1e-6
 """A parameter within this part of a half-width from the wall of its box is at the edge."""
+
+COVERAGE = 0.95
+"""Part of the intervals that hold the true value."""
 
 STEPS, SETTLED = 12, 1e-6
 """Gauss-Newton steps at most of a fit without a pose, and the part of g below which a step is the last: the next would
@@ -96,6 +100,7 @@ class Fit:
         s: standard deviation of one pose's modulus (with known attitudes of one axis), m/s^2, NaN without freedom,
             shape (R,).
         covariance: of the nine parameters, (m/s^2)^2, shape (R, 9, 9), NaN where it does not hold.
+        coverage: factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`.
         at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
@@ -124,6 +129,7 @@ class Fit:
     freedom: Int
     s: Float
     covariance: Float
+    coverage: Float
     at_wall: Bool
     rms: Float
     rms_before: Float
@@ -134,14 +140,31 @@ class Fit:
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
 
+    @cached_property
+    def attitudes(self) -> list[int | None]:
+        """How many distinct attitudes the poses hold, R of them; None where they were not counted."""
+        return count_attitudes(self.sample)
+
     @property
     def temperature(self) -> Temperature | None:
-        """The slopes with temperature, where there are any."""
-        return (
-            None
-            if self.solution is None or self.solution.slopes is None
-            else self.solution.slopes.temperature
-        )
+        """The slopes with temperature, where there are any, with their intervals; of one sensor."""
+        if self.solution is None or self.solution.slopes is None:
+            return None
+        return self.solution.slopes.temperature.with_intervals(float(self.coverage[0]))
+
+
+def coverage_of(freedom: Float | Int) -> Float:
+    """Return the coverage factors of 95 % intervals, Student's t [gum2008], shape (R,); NaN below one of freedom.
+
+    Here a sigma and its degrees of freedom, shape (R,), meet: whole or not, they are those of the sigma that is stated.
+    """
+    factors = {n: student_quantile(0.5 + 0.5 * COVERAGE, n) for n in set(freedom.tolist()) if n >= 1}
+    return np.array([factors.get(n, np.nan) for n in freedom.tolist()])
+
+
+def count_attitudes(sample: Sample) -> list[int | None]:
+    """Return how many distinct attitudes the poses of each sensor hold; None where they were not counted."""
+    return [None] * len(sample)
 
 
 def fit(solution: Solution) -> Fit:
@@ -180,6 +203,7 @@ def fit(solution: Solution) -> Fit:
         freedom=freedom,
         s=np.sqrt(variance),
         covariance=covariance,
+        coverage=coverage_of(freedom),
         at_wall=at_wall,
         rms=np.sqrt(sums[0] / sample.poses),
         rms_before=np.sqrt(sums[1] / sample.poses),
@@ -522,7 +546,7 @@ def _covariance(observability: Observability, variance: Float, walled: Bool, g: 
     )
 
 
-def firm(dop: Float, verdict: Sequence[Verdict], s: Float, g: float) -> Bool:
+def firm(dop: Float, verdict: Sequence[Geometry], s: Float, g: float) -> Bool:
     """Return which of the nine parameters of R sensors the linear covariance holds for, shape (R, 9).
 
     Poses that leave a direction open leave a valley of almost equal cost, and the valley bends: an error d along

@@ -6,7 +6,7 @@ determine the ellipsoid, the start is the least cost itself, and the solver conf
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -51,10 +51,13 @@ class Fleet:
         number: the sensors' numbers among the readings, shape (R,); poses: J of each.
         K_a, D_a: in the gauge of the settings, shapes (R, 3, 3) and (R, 3); sigma_k, sigma_d: their one-sigma.
         lower: K_a in gauge `lower`, shape (R, 3, 3).
+        coverage: factor from a sigma to the half-width of its 95 % interval, shape (R,).
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
-        verdict: good, weak, undetermined or failed, shape (R,); reason: why it is not good, in sentences.
-        caution: what speaks against the readings, in the sentences of `calibrate`, shape (R,).
+        verdict: good, weak, suspect, undetermined or failed, shape (R,); reason: what the poses leave open, or why it
+            failed, in sentences.
+        warnings: what speaks against the readings and the fit, as `calibrate` says it, a tuple of Notice each,
+            shape (R,).
         outlying: the poses beyond chance, in words.
     """
 
@@ -64,6 +67,7 @@ class Fleet:
     D_a: Float
     sigma_k: Float
     sigma_d: Float
+    coverage: Float
     lower: Float
     dop: Float
     cost: Float
@@ -72,13 +76,18 @@ class Fleet:
     rms_before: Float
     verdict: np.ndarray
     reason: np.ndarray
-    caution: np.ndarray
+    warnings: np.ndarray
     outlying: np.ndarray
 
     @property
     def determined(self) -> Bool:
-        """Which sensors are good or weak, shape (R,)."""
-        return np.asarray((self.verdict == "good") | (self.verdict == "weak"))
+        """Which sensors the poses determine, the suspect ones too, shape (R,)."""
+        return np.asarray((self.verdict != "undetermined") & (self.verdict != FAILED))
+
+    @property
+    def warned(self) -> Bool:
+        """Of which sensors there is a note or a warning, shape (R,)."""
+        return np.array([len(said) > 0 for said in self.warnings], dtype=bool)
 
 
 def check_settings(settings: Settings) -> None:
@@ -167,6 +176,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         D_a=fit.D,
         sigma_k=fit.sigma_K,
         sigma_d=fit.sigma_D,
+        coverage=fit.coverage,
         lower=fit.lower,
         dop=fit.dop,
         cost=fit.value,
@@ -175,9 +185,17 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         rms_before=fit.rms_before,
         verdict=np.array(assessment.verdicts, dtype=object),
         reason=texts(assessment.reasons),
-        caution=texts(assessment.cautions),
+        warnings=_objects(assessment.warnings),
         outlying=outlying,
     )
+
+
+def _objects(values: Sequence[object]) -> np.ndarray:
+    """Return values, tuples too, as an array of one dimension."""
+    array = np.empty(len(values), dtype=object)
+    for at, value in enumerate(values):
+        array[at] = value
+    return array
 
 
 def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
@@ -194,6 +212,7 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
         D_a=nan(3),
         sigma_k=nan(3, 3),
         sigma_d=nan(3),
+        coverage=nan(),
         lower=nan(3, 3),
         dop=nan(9),
         cost=nan(),
@@ -202,7 +221,7 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
         rms_before=nan(),
         verdict=np.full(len(words), FAILED, dtype=object),
         reason=np.array([f"{word[0].upper()}{word[1:]}." for word in words], dtype=object),
-        caution=nothing,
+        warnings=_objects([()] * len(number)),
         outlying=nothing,
     )
 
@@ -262,7 +281,7 @@ def noise(fleet: Fleet, g: float) -> Quantity:
 
 
 def standouts(fleet: Fleet, g: float) -> list[Standout]:
-    """Return the sensors that stand out from those whose verdict is good or weak, farthest first, the noisy ones last.
+    """Return the sensors that stand out from those that their poses determine, farthest first, the noisy ones last.
 
     Parameters by their distance from the median over 1.4826 times the median absolute deviation, under Student's
     distribution; s by chi-square against the noise that the fleet shares. A sensor whose poses tell less of a parameter

@@ -17,6 +17,7 @@ from accelcal_cli.calibration.fit import (
     OUTLIER_LEVEL,
     Fit,
     PoseResiduals,
+    coverage_of,
     room_of,
     uncalibrated,
 )
@@ -83,6 +84,7 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         freedom=np.array([freedom]),
         s=np.array([s]),
         covariance=s**2 * nine[None],
+        coverage=coverage_of(np.array([freedom])),
         at_wall=np.zeros((1, 12), dtype=bool),
         rms=np.sqrt([np.mean(modulus**2)]),
         rms_before=np.sqrt([np.mean(raw**2)]),

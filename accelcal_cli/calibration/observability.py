@@ -48,7 +48,8 @@ it, 1e-6, is the smallest relative difference between poses that an ordinary CSV
 ALIGNED = np.repeat([False, True, False], 3)
 """The parameters that are not estimated when the axes are taken as perpendicular."""
 
-Verdict = Literal["good", "weak", "undetermined"]
+Geometry = Literal["good", "weak", "undetermined"]
+"""What the poses alone say of a calibration: how an error of one reading comes out in the parameters."""
 
 
 def design(u: Float) -> Float:
@@ -57,7 +58,7 @@ def design(u: Float) -> Float:
     return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
 
 
-def verdict_of(worst: float, rank: int, parameters: int = 9) -> Verdict:
+def verdict_of(worst: float, rank: int, parameters: int = 9) -> Geometry:
     """Return the verdict on poses that determine `rank` directions, with this largest dilution of precision."""
     if rank < parameters or worst > UNDETERMINED:
         return "undetermined"
@@ -148,12 +149,12 @@ class Observability:
         return np.asarray(self.dop.max(axis=-1))
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Geometry:
         """Definition: undetermined above 25 or below full rank, weak above 10, good otherwise. One set of poses."""
         return verdict_of(float(self.worst), int(self.rank), len(self.names))
 
     @property
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[Geometry]:
         """The verdict on each of R sets of poses."""
         return [
             verdict_of(worst, rank, len(self.names))

@@ -9,30 +9,38 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.calibration.distributions import student_quantile
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     BIAS,
     MISALIGNMENT,
     PARAMETERS,
+    ROWS_COLUMNS,
     SCALE,
     UNDETERMINED,
-    Verdict,
 )
 from accelcal_cli.calibration.settings import LARGEST
 from accelcal_cli.config import parse_mapping, read_text
 from accelcal_cli.errors import ConfigError, DataError, UsageError
+from accelcal_cli.notices import Notice
 from accelcal_cli.schema import Limits, array, from_mapping, to_mapping
 from accelcal_cli.sensor.model import ErrorModel, Gauge
 
-SCHEMA = "accelcal/calibration/1"
+SCHEMA = "accelcal/calibration/2"
 """Name and version of the record; a reader refuses what it does not know."""
+
+OLDER = "accelcal/calibration/1"
+"""The version before it, which is read, too: see `_of_older`."""
+
+Verdict = Literal["good", "weak", "suspect", "undetermined"]
+"""Of a calibration: that of its poses, lowered by a warning and by what the search and the count of poses say."""
 
 MOST = 2**53
 """Largest count: up to here floats hold every whole number."""
@@ -55,6 +63,7 @@ class Temperature:
         scale: k_i, relative change of the scale factors per degree, shape (3,).
         bias: b_i, change of the bias per degree, output units, shape (3,).
         sigma_scale, sigma_bias: their one-sigma, shape (3,).
+        interval_scale, interval_bias: half-widths of their 95 % intervals, shape (3,).
         dop: dilution of precision of the slopes, taken as force at half the range, shape (6,).
     """
 
@@ -65,7 +74,13 @@ class Temperature:
     bias: Vector
     sigma_scale: MaybeVector
     sigma_bias: MaybeVector
+    interval_scale: MaybeVector
+    interval_bias: MaybeVector
     dop: Annotated[Float, array(6, none=math.nan)]
+
+    def with_intervals(self, factor: float) -> Temperature:
+        """Return the same slopes with the intervals of a coverage factor, NaN for none."""
+        return replace(self, interval_scale=factor * self.sigma_scale, interval_bias=factor * self.sigma_bias)
 
     def at_reference(self, output: Float, degrees: Float, D: Float) -> Float:
         """Return readings as they would be at the reference temperature, shape (B, 3).
@@ -80,7 +95,7 @@ class Temperature:
 
 @dataclass(frozen=True, eq=False)
 class Sigma:
-    """One-sigma of the parameters; NaN where the poses do not determine them.
+    """One-sigma of the parameters, or the half-widths of their intervals; NaN where the poses do not determine them.
 
     Attributes:
         K_a: shape (3, 3), output units per m/s^2.
@@ -89,6 +104,9 @@ class Sigma:
 
     K_a: Annotated[Float, array(3, 3, none=math.nan)]
     D_a: MaybeVector
+
+
+NO_INTERVAL = Sigma(np.full((3, 3), np.nan), np.full(3, np.nan))
 
 
 @dataclass(frozen=True)
@@ -150,22 +168,23 @@ class Calibration:
         D_a: bias, shape (3,), output units.
         K_A: inverse matrix, shape (3, 3); f_0 = K_A D_a, shape (3,), m/s^2.
         gauge: lower, upper, symmetric or full.
-        sigma: one-sigma of K_a and D_a.
+        sigma: one-sigma of K_a and D_a; interval: half-widths of their 95 % intervals, `coverage_factor` times sigma
+            (Student's t, None without degrees of freedom), NaN for those that are not determined.
         dop: dilution of precision.
-        verdict: good, weak or undetermined; `reasons` says why in sentences.
+        verdict: good, weak, suspect or undetermined; `reasons` says in sentences what the poses leave open.
         suggestions: poses that would mend it.
-        cautions: sentences about residuals and search that do not change the verdict, which is of the poses.
+        warnings: what speaks against the readings, the fit or the search; one of severity `warning` makes it suspect.
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
         s: standard deviation of one pose's modulus, m/s^2, with known attitudes of one axis; NaN without freedom.
         freedom: J - 9 degrees of freedom, J - 15 with slopes with temperature, 3 J - 12 with known attitudes.
-        noise_ratio, noise_chance: s over the noise expected from the scatter within the poses, and the p-value of that
-            ratio; None where the readings do not tell.
+        residual_noise_ratio, residual_noise_p: s over the noise expected from the scatter within the poses, and the
+            p-value of that ratio; None where the readings do not tell.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9); NaN where they have no sigma.
         information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
-        poses: J.
+        poses: J; attitudes: how many distinct ones they hold, None where they were not counted.
         evaluations: of the cost, search and polish together.
         runs, runs_agreeing: searches made, and how many ended in the best one's minimum.
         poses_fit: residuals pose by pose (all up to 1000 poses, the worst 20 of more).
@@ -185,11 +204,12 @@ class Calibration:
     f_0: Vector
     gauge: Gauge
     sigma: Sigma
+    interval: Sigma
     dop: Dop
     verdict: Verdict
     reasons: tuple[str, ...]
     suggestions: tuple[str, ...]
-    cautions: Annotated[tuple[str, ...], Limits(older=())]
+    warnings: tuple[Notice, ...]
     cost_search: MaybeNan
     cost: MaybeNan
     rms: MaybeNan
@@ -197,13 +217,14 @@ class Calibration:
     before: str
     s: MaybeNan
     freedom: Count
-    noise_ratio: float | None
-    noise_chance: float | None
+    residual_noise_ratio: float | None
+    residual_noise_p: float | None
     covariance: Annotated[Float, array(9, 9, none=math.nan)]
     information: Annotated[Float, array(9, 9)]
     nominal_scale: MaybeVector
     nominal_bias: MaybeVector
     poses: Count
+    attitudes: Count | None
     evaluations: Count
     runs: Count
     runs_agreeing: Count
@@ -218,6 +239,7 @@ class Calibration:
     version: str
     schema: str = SCHEMA
     temperature: Temperature | None = None
+    coverage_factor: float | None = None
 
     @property
     def model(self) -> ErrorModel:
@@ -245,6 +267,38 @@ class Calibration:
         poor: Bool = np.array([self.dop.parameters[name] for name in PARAMETERS]) > UNDETERMINED
         return poor | np.isnan(np.diagonal(self.covariance))
 
+    @property
+    def lost_entries(self) -> Bool:
+        """Which entries of K_a (rows 0 to 2) and D_a (row 3) are not determined, shape (4, 3)."""
+        nine = self.lost
+        lost = np.zeros((4, 3), dtype=bool)
+        for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+            lost[i, j] = lost[j, i] = nine[p]
+        lost[3] = nine[BIAS]
+        lost[:3] &= self.K_a != 0  # a zero of the gauge is exact
+        return lost
+
+    @property
+    def interval_nine(self) -> Float:
+        """Half-widths of the 95 % intervals of the nine parameters, gauge `lower`, m/s^2, shape (9,), NaN for none."""
+        factor = math.nan if self.coverage_factor is None else self.coverage_factor
+        return np.where(self.lost, np.nan, factor * np.sqrt(np.diagonal(self.covariance)))
+
+    def with_intervals(self, factor: float) -> Calibration:
+        """Return the same result with the 95 % intervals of a coverage factor, NaN for none."""
+        lost = self.lost_entries
+        interval = Sigma(
+            np.where(lost[:3], np.nan, factor * self.sigma.K_a),
+            np.where(lost[3], np.nan, factor * self.sigma.D_a),
+        )
+        slopes = None if self.temperature is None else self.temperature.with_intervals(factor)
+        return replace(
+            self,
+            interval=interval,
+            coverage_factor=None if math.isnan(factor) else factor,
+            temperature=slopes,
+        )
+
     def check_determined(self, name: str, *, force: bool = False) -> None:
         """Refuse to be used where the poses left parameters undetermined, unless forced.
 
@@ -268,6 +322,9 @@ class Calibration:
         Raises:
             DataError: not a record of this schema, a part missing or of another kind; `where` is named in the message.
         """
+        older = record.get("schema") == OLDER
+        if older:
+            record = _of_older(record)
         if record.get("schema") != SCHEMA:
             raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
         place = f"{where}: not a calibration result"
@@ -279,7 +336,46 @@ class Calibration:
             raise DataError(f"{place}: dop: parameters: expected {', '.join(PARAMETERS)}")
         if np.abs(result.K_a).max() < 1 / LARGEST or np.linalg.matrix_rank(result.K_a) < 3:
             raise DataError(f"{place}: K_a: is singular; expected an invertible matrix")
-        return result
+        if not older:
+            return result
+        freedom = result.freedom
+        return result.with_intervals(student_quantile(0.975, freedom) if freedom > 0 else math.nan)
+
+
+AGAIN = "Calibrate the readings again."
+OLD_RULE = Notice(
+    "legacy",
+    "note",
+    "The result was written by an earlier version: its verdict is by the old rule, of the poses alone.",
+    AGAIN,
+)
+
+
+def _of_older(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record of schema OLDER as one of SCHEMA; its intervals are still to come.
+
+    A record that is none stays as wrong as it is, for the reader to say so.
+    """
+    new: dict[str, Any] = {
+        "cautions": [],
+        **record,
+        "schema": SCHEMA,
+        "coverage_factor": None,
+        "attitudes": None,
+    }
+    new["interval"] = {"K_a": [[None] * 3] * 3, "D_a": [None] * 3}
+    for old, key in (("noise_ratio", "residual_noise_ratio"), ("noise_chance", "residual_noise_p")):
+        if old in new:
+            new[key] = new.pop(old)
+    slopes = new.get("temperature")
+    if isinstance(slopes, Mapping):
+        new["temperature"] = {**slopes, "interval_scale": [None] * 3, "interval_bias": [None] * 3}
+    said = new.pop("cautions")
+    if isinstance(said, list):
+        said = [{"key": "legacy", "severity": "note", "text": text, "remedy": AGAIN} for text in said]
+        said.append(to_mapping(OLD_RULE))
+    new["warnings"] = said
+    return new
 
 
 def load_result(path: str | Path, stdin: BinaryIO | None = None) -> Calibration:

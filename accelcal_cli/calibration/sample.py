@@ -84,7 +84,7 @@ class Sample:
             lower=np.stack([one.lower for one in readings]),
             upper=np.stack([one.upper for one in readings]),
             blocks=blocks,
-            doubtful=np.array([bool(one.cautions) for one in readings]),
+            doubtful=np.array([bool(one.warnings) for one in readings]),
             readings=readings.__getitem__,
             count=stack("count"),
             scatter=stack("scatter"),

@@ -73,7 +73,16 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
     units = np.repeat([1.0 / g, 1.0], 3) * np.concatenate([np.ones(3), np.diagonal(low.K)]) / half
     (scale, bias), (sigma_scale, sigma_bias) = np.split(p[9:] * units, 2), np.split(s * dop * units, 2)
     temperature = Temperature(
-        middle, float(degrees.min()), float(degrees.max()), scale, bias, sigma_scale, sigma_bias, dop
+        reference=middle,
+        low=float(degrees.min()),
+        high=float(degrees.max()),
+        scale=scale,
+        bias=bias,
+        sigma_scale=sigma_scale,
+        sigma_bias=sigma_bias,
+        interval_scale=np.full(3, np.nan),  # the fit knows their factor
+        interval_bias=np.full(3, np.nan),
+        dop=dop,
     )
     B, C = information[:9, 9:], information[9:, 9:]
     brought = temperature.at_reference(N, degrees, _moved(low, p, g).D)

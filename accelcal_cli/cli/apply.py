@@ -64,7 +64,7 @@ def command(
     wanted = ColumnOptions(unit, replace, prefix, tilt, noise)
     calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)
-    options.caution(result, calibration.cautions, quiet)
+    options.warn(result, calibration.warnings, quiet)
     table = open_table(data, sys.stdin.buffer, hashed=False)
     try:
         log = prepare(calibration, table, options.split_columns(columns), wanted)
@@ -76,6 +76,6 @@ def command(
     finally:
         table.close()
     sys.stdout.flush()
-    options.caution(data, log.formula.cautions(), quiet)
+    options.warn(data, log.formula.warnings(), quiet)
     options.tell(log.notes, quiet)
     options.tell_written([output], quiet)

@@ -132,7 +132,7 @@ def command(
     """Calibrate an accelerometer from static readings.
 
     Prints the K matrix and the bias with their uncertainty, how well the poses determine them, and a verdict.
-    Exit code 1 means that the verdict is "undetermined" or that --tolerance was missed.
+    Exit code 1 means that the verdict is "suspect" or "undetermined", or that --tolerance was missed.
     """
     from accelcal_cli.calibration.calibrate import calibrate
     from accelcal_cli.io.readings import read_readings
@@ -160,11 +160,11 @@ def command(
     with process.even_if_unread(sys.stderr):
         options.tell_written([output], quiet)
         if format != "table" or output == "-":  # the table shows them itself
-            options.caution(data, result.cautions, quiet)
+            options.warn(data, result.warnings, quiet)
         options.tell_assumed_gravity(stated_g, settings.g, quiet, _units_of_g(result))
         if tolerance is not None and missed:
             options.tell([f"rms {result.rms:.6g} is above the tolerance {tolerance:.6g}"])
-    if missed or result.verdict == "undetermined":
+    if missed or result.verdict in options.BAD_VERDICTS:
         raise typer.Exit(options.BAD_VERDICT)
 
 

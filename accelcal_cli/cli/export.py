@@ -83,7 +83,7 @@ def command(
         raise UsageError(f"--to {to} is not text for a terminal; name a file with -o")
     calibration = options.load_result(result)
     calibration.check_determined(result, force=force)
-    options.caution(result, calibration.cautions, quiet)
+    options.warn(result, calibration.warnings, quiet)
     export = exporter.export(calibration)
     with whole_file(output, binary=True) as file:
         file.write(export.content)

@@ -86,7 +86,7 @@ def command(
 
     Every sensor as `calibrate --optimizer levenberg-marquardt` would by itself. Prints how the fleet spreads, which
     sensors fit worst, which stand out and which are not determined; --format csv or json prints a row for each.
-    Exit code 1 means that a sensor is undetermined or failed, or missed the --tolerance.
+    Exit code 1 means that a sensor is suspect, undetermined or failed, or missed the --tolerance.
     """
     from accelcal_cli.calibration.fleet import calibrate_fleet, check_settings
     from accelcal_cli.calibration.settings import load_settings
@@ -161,8 +161,8 @@ def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:
-    """Return which sensors are not determined or too far off, shape (R,) each, by what they are."""
-    kinds = {"undetermined or failed": ~fleet.determined}
+    """Return which sensors are suspect, not determined or too far off, shape (R,) each, by what they are."""
+    kinds = {"undetermined or failed": ~fleet.determined, "suspect": fleet.verdict == "suspect"}
     if tolerance is not None:  # A sensor that failed has no rms; it is named already.
         kinds[f"with an rms above the tolerance {tolerance:.6g}"] = fleet.rms > tolerance
     return kinds

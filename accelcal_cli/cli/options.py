@@ -25,6 +25,7 @@ from accelcal_cli.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
+    from accelcal_cli.notices import Notice
     from accelcal_cli.views.blocks import Block, Table
 
 Complete = Callable[[str], list[str]]
@@ -102,6 +103,9 @@ def stated(**values: Any) -> dict[str, Any]:
 
 BAD_VERDICT = 1
 """Exit code of a command that did its work and found something bad."""
+
+BAD_VERDICTS = ("suspect", "undetermined")
+"""Verdicts on a calibration that have that exit code."""
 
 PLOT_SUFFIXES = (".png", ".svg")
 FORMATS = ("table", "json", "csv")
@@ -472,9 +476,9 @@ def tell_written(paths: Iterable[str | None], quiet: bool) -> None:
     tell((f"wrote {path}" for path in paths if path not in (None, "-")), quiet)
 
 
-def caution(source: str, cautions: Iterable[str], quiet: bool) -> None:
+def warn(source: str, notices: Iterable[Notice], quiet: bool) -> None:
     """Say on standard error, unless quiet, what speaks against trusting a file."""
-    tell((f"{source}: caution: {text}" for text in cautions), quiet)
+    tell((f"{source}: {notice.severity}: {notice}" for notice in notices), quiet)
 
 
 def tell_assumed_gravity(stated: float | None, g: float, quiet: bool, further: str = "") -> None:

@@ -88,7 +88,7 @@ def command(
         )
     with process.even_if_unread(sys.stderr):
         if so_far is not None and format != "table":  # the table shows them itself
-            options.caution(str(data), so_far.cautions, quiet)
+            options.warn(str(data), so_far.warnings, quiet)
     if proposal.verdict == "undetermined":
         raise typer.Exit(options.BAD_VERDICT)
 

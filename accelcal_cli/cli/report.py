@@ -25,7 +25,7 @@ def command(
 
     Verdict, parameters with sigma, residuals, poses, dilution, convergence, settings, origin. One file without
     links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the verdict is
-    "undetermined"; the report is written all the same.
+    "suspect" or "undetermined"; the report is written all the same.
     """
     from accelcal_cli.output.files import is_stream, whole_file
     from accelcal_cli.output.report import check_packages, page
@@ -41,5 +41,5 @@ def command(
         file.write(text.encode())  # the page says that it is UTF-8, whatever the terminal takes
     with process.even_if_unread(sys.stderr):
         options.tell_written([output], quiet)
-    if calibration.verdict == "undetermined":
+    if calibration.verdict in options.BAD_VERDICTS:
         raise typer.Exit(options.BAD_VERDICT)

@@ -63,9 +63,9 @@ def command(
             format, lambda: differences(verification), lambda: blocks(verification), verification.record
         )
     with process.even_if_unread(sys.stderr):
-        options.caution(result, old.cautions, quiet)
+        options.warn(result, old.warnings, quiet)
         if format != "table":  # the table shows them itself
-            options.caution(readings.source, verification.cautions, quiet)
+            options.warn(readings.source, verification.warnings, quiet)
         if not verification.within:
             options.tell([f"rms {verification.rms:.6g} is above the tolerance {tolerance:.6g}"], quiet)
     if not verification.passed:

@@ -24,10 +24,11 @@ from accelcal_cli.io.readings import (
     Readings,
     check_rows,
     doubts,
-    log_cautions,
+    log_warnings,
     number_labels,
 )
 from accelcal_cli.io.stream import RowStore
+from accelcal_cli.notices import Notice
 
 SLAB = 2_000_000
 """Poses that are in memory at once, unless one sensor has more."""
@@ -135,14 +136,14 @@ class FleetReadings:
             origin.columns,
             origin.notes,
             lambda pose: self.where(int(poses[pose])),
-            self.cautions(batch, at),
+            self.warnings(batch, at),
         )
 
-    def cautions(self, batch: Batch, at: int) -> tuple[str, ...]:
-        """Return why the readings of the sensor at `at` in a batch may not be poses, in sentences."""
+    def warnings(self, batch: Batch, at: int) -> tuple[Notice, ...]:
+        """Return why the readings of the sensor at `at` in a batch may not be poses."""
         origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
         first, span = output[:LOOKED_AT], float(np.ptp(output, axis=0).max())
-        log = log_cautions(len(output), first, span, timed=origin.timed) if origin.rows else ()
+        log = log_warnings(len(output), first, span, origin.name, timed=origin.timed) if origin.rows else ()
         return (*log, *doubts(first, origin.columns))
 
     def batches(self) -> Iterator[Batch]:

@@ -2,12 +2,13 @@
 
 `read_readings` gathers the rows of a table into poses: one per row, or one per label, averaged as the rows stream by
 (`LabelledMeans`). The outputs stay in a store that may be on disk; a calibration takes them in blocks. Before anything
-is fitted, `log_cautions` and `doubts` say what makes them doubtful: logs, dead or duplicate axes, copied rows.
+is fitted, `log_warnings` and `doubts` say what makes them doubtful: logs, dead or duplicate axes, copied rows.
 """
 
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, choose
 from accelcal_cli.io.reader import LIMIT, PLAIN, InputTable, ReadOptions, RowBlock, open_table
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
+from accelcal_cli.notices import COMMAND, Notice
 
 STUCK = 1_000_000
 """Equal readings in a row after which an input is not read on."""
@@ -38,6 +40,9 @@ range."""
 MANY_COPIES = 1 / 3
 """Part of the poses from which on copies are reported. One row that occurs twice does no harm, and readings without
 noise repeat where an attitude does."""
+
+LIVE = "Name the columns of three living axes (--columns), and turn the sensor about all of them."
+"""What to do about a dead axis."""
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of axes."""
@@ -59,7 +64,7 @@ class Readings:
         reference: known specific force, shape (J, 3), m/s^2 or g as given.
         temperature: shape (J,), as given, NaN where missing.
         notes: what the reader did that a user should know.
-        cautions: why the readings may not be what they are taken for.
+        warnings: why the readings may not be what they are taken for.
     """
 
     source: str
@@ -74,7 +79,7 @@ class Readings:
     reference: Float | None = None
     temperature: Float | None = None
     notes: tuple[str, ...] = ()
-    cautions: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 
@@ -140,15 +145,15 @@ class Readings:
         columns: tuple[str, str, str],
         notes: Sequence[str],
         where: Callable[[int], str],
-        cautions: tuple[str, ...] | None = None,
+        warnings: tuple[Notice, ...] | None = None,
     ) -> Self:
-        """Return the same poses as those of another input, with its cautions if stated."""
+        """Return the same poses as those of another input, with its warnings if stated."""
         return replace(
             self,
             sha256=sha256,
             columns=columns,
             notes=tuple(notes),
-            cautions=self.cautions if cautions is None else cautions,
+            warnings=self.warnings if warnings is None else warnings,
             _line=where,
         )
 
@@ -246,7 +251,7 @@ class Collector:
         self._check()
         _, first = next(self.store.blocks(LOOKED_AT))
         span, timed = float((self.upper - self.lower).max()), columns.time is not None
-        log = log_cautions(self.store.rows, first, span, timed=timed) if means is None else ()
+        log = log_warnings(self.store.rows, first, span, self.source, timed=timed) if means is None else ()
         return Readings(
             self.source,
             sha256,
@@ -260,7 +265,7 @@ class Collector:
             reference=None if others is None or columns.reference is None else others[:, :3],
             temperature=None if others is None or columns.temperature is None else others[:, -1],
             notes=tuple(self.notes),
-            cautions=(*log, *doubts(first, columns.names)),
+            warnings=(*log, *doubts(first, columns.names)),
             _store=self.store,
             _line=where,
         )
@@ -391,45 +396,50 @@ def number_labels(index: dict[Label, int], labels: Sequence[Label]) -> Int:
     return np.fromiter((index.setdefault(label, len(index)) for label in labels), np.intp, len(labels))
 
 
-def log_cautions(rows: int, first: Float, span: float, *, timed: bool) -> tuple[str, ...]:
-    """Return a caution for rows that are taken for poses and may be a log: timed, or each much like the one before.
+def log_warnings(rows: int, first: Float, span: float, source: str, *, timed: bool) -> tuple[Notice, ...]:
+    """Return a warning for rows that are taken for poses and may be a log: timed, or each much like the one before.
 
     Args:
         rows: how many; first: the first of them, shape (B, 3), LOOKED_AT at most.
-        span: the largest range of an axis; timed: whether they have times.
+        span: the largest range of an axis; source: of the rows, a path or a name in angle brackets.
+        timed: whether they have times.
     """
     if rows < RAW_ROWS or not (timed or np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) < ALIKE * span):
         return ()
-    return (
-        f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, find its poses with "
-        "accelcal detect, or calibrate with --raw; of many readings of one pose, label the poses in a column.",
+    text = (
+        f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, its static poses "
+        "have to be found first; of many readings of one pose, label the poses in a column."
     )
+    place = {"<stdin>": "-", "<array>": "LOG"}.get(source, shlex.quote(source))
+    return (Notice("log", "warning", text, f"{COMMAND}calibrate {place} --raw"),)
 
 
-def doubts(output: Float, names: Sequence[str]) -> list[str]:
-    """Return what is doubtful about poses, in sentences.
+def doubts(output: Float, names: Sequence[str]) -> list[Notice]:
+    """Return what is doubtful about poses.
 
     Args:
         output: of the poses, or of many of them, shape (J, 3), sensor units.
         names: of the three columns.
     """
-    sentences = [
+    dead = [
         f'Column "{name}" is {output[0, i]:g} in every pose: its axis is dead or was never turned.'
         for i, name in enumerate(names)
         if (output[:, i] == output[0, i]).all()
     ]
-    sentences += [
+    dead += [
         f'Columns "{names[i]}" and "{names[j]}" are equal in every pose: they show one axis.'
         for i, j in PAIRS
         if (output[:, i] == output[:, j]).all()
     ]
+    notices = [Notice("dead-axis", "warning", text, LIVE) for text in dead]
     copies = len(output) - len({row.tobytes() for row in output})
     if copies >= MANY_COPIES * len(output):
-        sentences.append(
+        text = (
             f"{copies:,} of {len(output):,} poses repeat another to the last digit. Sigma counts them as independent "
-            "measurements: leave copies out."
+            "measurements."
         )
-    return sentences
+        notices.append(Notice("duplicate-rows", "warning", text, "Leave copies out."))
+    return notices
 
 
 def may_be_doubtful(output: Float, poses: Int) -> Bool:

@@ -30,6 +30,7 @@ NARROWEST_CURVE, NARROWEST_CURVES = 40, 48
 VERDICT_STYLE = {
     "good": "bold green",
     "weak": "bold yellow",
+    "suspect": "bold red",
     "undetermined": "bold red",
     "unchanged": "bold green",
     "changed": "bold red",
@@ -70,13 +71,12 @@ def _show_paragraph(block: Paragraph, out: Console) -> None:
 
 def _show_conclusion(block: Conclusion, out: Console) -> None:
     style = VERDICT_STYLE.get(block.verdict, "bold")
-    if block.cautions and style == VERDICT_STYLE["good"]:  # no green light with a warning under it
-        style = VERDICT_STYLE["weak"]
     out.print(Text.assemble((f"{block.title}: ", "bold"), (block.verdict, style)))
     for reason in block.reasons:
         out.print(Text(f"  {reason}"))
-    for caution in block.cautions:
-        out.print(Text.assemble(("Caution: ", "bold yellow"), caution))
+    for notice in block.warnings:
+        head, colour = ("Warning: ", "bold yellow") if notice.severity == "warning" else ("Note: ", "bold")
+        out.print(Text.assemble((head, colour), str(notice)))
 
 
 def _show_convergence(block: Convergence, out: Console) -> None:

@@ -65,7 +65,7 @@ def _frame(table: Table) -> polars.DataFrame:
     columns = [
         polars.Series(
             column.label,
-            [_finite(row[i]) for row in table.rows],
+            [_finite(str(row[i]) if isinstance(row[i], tuple) else row[i]) for row in table.rows],
             dtype=types.get(column.format, polars.Float64),
         )
         for i, column in enumerate(table.columns)

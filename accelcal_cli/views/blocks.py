@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.notices import Notice
 
 
 @dataclass(frozen=True)
@@ -96,17 +97,17 @@ BLANK = Paragraph()
 
 @dataclass(frozen=True)
 class Conclusion:
-    """A verdict, the reasons for it, and warnings about what it does not cover.
+    """A verdict, the reasons for it, and what speaks against it.
 
     Attributes:
         verdict: one word.
-        reasons, cautions: sentences.
+        reasons: sentences; warnings: notes and warnings.
         title: what it is a verdict on.
     """
 
     verdict: str
     reasons: Sequence[str]
-    cautions: Sequence[str] = ()
+    warnings: Sequence[Notice] = ()
     title: str = "Verdict"
 
 

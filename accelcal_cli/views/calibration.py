@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, PARAMETERS, SCALE, UNDETERMINED, WEAK
 from accelcal_cli.calibration.result import Calibration, Temperature
@@ -21,6 +20,9 @@ KINDS = (
 """Kinds of parameters with the unit that their sigma is shown in, and its size in parts of g."""
 
 WORST_SHOWN = 5
+INTERVAL = "+- 95 %"
+"""Heading of the half-widths of 95 % intervals."""
+
 UNKNOWN, ASSUMED = "not determined", "taken as 0"
 
 
@@ -39,26 +41,30 @@ def blocks(result: Calibration) -> list[Block]:
     """Return what a calibration shows: verdict first, then tables, notes and convergence."""
     title = f"Convergence of {result.optimizer} (best cost L so far, logarithmic)"
     curve = [Convergence(title, {"": result.convergence})] if len(result.convergence) > 1 else []
-    conclusion = Conclusion(result.verdict, result.reasons, result.cautions)
+    conclusion = Conclusion(result.verdict, result.reasons, result.warnings)
     return [conclusion, BLANK, *tables(result), *notes(result.notes), *curve]
 
 
 def parameters(result: Calibration) -> Table:
-    """Return K_a and D_a with their one-sigma."""
-    lost = _undetermined(result)
-    entries = [  # value, sigma and whether it is lost, of a row of K_a and then the bias
+    """Return K_a and D_a with their 95 % intervals."""
+    lost, interval = result.lost_entries, result.interval
+    entries = [  # value, interval and whether it is lost, of a row of K_a and then the bias
         np.column_stack(pair)
-        for pair in ((result.K_a, result.D_a), (result.sigma.K_a, result.sigma.D_a), (lost[:3], lost[3]))
+        for pair in ((result.K_a, result.D_a), (interval.K_a, interval.D_a), (lost[:3], lost[3]))
     ]
     rows = tuple(
         (axis, *chain.from_iterable(_pair(v, s, lost=bool(gone)) for v, s, gone in zip(*row, strict=True)))
         for axis, *row in zip(AXES, *entries, strict=True)
     )
     columns = [
-        (Column(name, format=".8g"), Column("sigma", format=".2g", key=f"sigma_{name}", beside=True))
+        (Column(name, format=".8g"), Column(INTERVAL, format=".2g", key=f"interval_{name}", beside=True))
         for name in ("K_x", "K_y", "K_z", "bias")
     ]
     notes = [f"K_a in output units per {result.unit}, bias D_a in output units, gauge {result.gauge}."]
+    if result.coverage_factor is not None:
+        notes.append(
+            f"{INTERVAL}: half of the 95 % interval, {result.coverage_factor:.3g} sigma (Student's t)."
+        )
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
             "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
@@ -68,36 +74,25 @@ def parameters(result: Calibration) -> Table:
     return Table("Calibration", (Column("axis"), *chain.from_iterable(columns)), rows, tuple(notes))
 
 
-def _undetermined(result: Calibration) -> NDArray[np.bool_]:
-    """Return which entries of K_a (rows 0 to 2) and D_a (row 3) the poses leave undetermined, shape (4, 3)."""
-    nine = result.lost
-    lost = np.zeros((4, 3), dtype=bool)
-    for p, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))):
-        lost[i, j] = lost[j, i] = nine[p]
-    lost[3] = nine[6:]
-    lost[:3] &= result.K_a != 0  # a zero of the gauge is exact
-    return lost
-
-
-def _pair(value: float, sigma: float, *, lost: bool) -> list[object]:
-    """Return a value and its sigma, or that the poses do not determine it."""
+def _pair(value: float, interval: float, *, lost: bool) -> list[object]:
+    """Return a value and its interval, or that the poses do not determine it."""
     if lost:
         return [UNKNOWN, None]
-    return [value, sigma if np.isfinite(sigma) else None]
+    return [value, interval if np.isfinite(interval) else None]
 
 
 def engineering(result: Calibration) -> Table:
     """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
     metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
-    # In gauge lower, as their sigma: another gauge, above all the free rotation of gauge full, moves a scale factor
-    # by half the square of the misalignments, which is many times that sigma.
+    # In gauge lower, as their intervals: another gauge, above all the free rotation of gauge full, moves a scale factor
+    # by half the square of the misalignments, which is many times their size.
     K = result.model.in_gauge("lower").K
     angle = units.misalignment(K)
     angles = [angle[i, j] + angle[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
     bias = units.bias_force(K, result.D_a - result.nominal_bias) / per_g
     values = np.concatenate([units.scale_error(K, result.nominal_scale), angles, bias])
-    sigma = np.sqrt(np.diagonal(result.covariance)) / per_g
+    interval = result.interval_nine / per_g
     kinds = (
         ("scale factor error", "ppm", units.PPM, "%", 100.0),
         ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
@@ -106,16 +101,16 @@ def engineering(result: Calibration) -> Table:
     rows = []
     for p, name in enumerate(PARAMETERS):
         kind, unit, factor, second, second_factor = kinds[p // 3]
-        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], sigma[p], lost=bool(result.lost[p]))
+        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], interval[p], lost=bool(result.lost[p]))
         first, other = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
         rows.append((f"{kind} {name.split()[-1]}", *first, unit, *other, second))
     columns = (
         Column("parameter"),
         Column("value", format=",.6g"),
-        Column("sigma", format=",.3g", beside=True),
+        Column(INTERVAL, format=",.3g", key="interval", beside=True),
         Column("unit", beside=True),
         Column("value", format=",.6g", key="value_2"),
-        Column("sigma", format=",.3g", key="sigma_2", beside=True),
+        Column(INTERVAL, format=",.3g", key="interval_2", beside=True),
         Column("unit", key="unit_2", beside=True),
     )
     return Table("Engineering view", columns, tuple(rows), (_reference(result),))
@@ -145,19 +140,24 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
         (
             f"scale factor {AXES[i]}",
             slopes.scale[i] * units.PPM,
-            slopes.sigma_scale[i] * units.PPM,
+            slopes.interval_scale[i] * units.PPM,
             "ppm per degree",
         )
         for i in range(3)
     ]
     rows += [
-        (f"bias {AXES[i]}", slopes.bias[i] * force[i], slopes.sigma_bias[i] * force[i], "micro-g per degree")
+        (
+            f"bias {AXES[i]}",
+            slopes.bias[i] * force[i],
+            slopes.interval_bias[i] * force[i],
+            "micro-g per degree",
+        )
         for i in range(3)
     ]
     columns = (
         Column("parameter"),
         Column("slope", format=",.2f"),
-        Column("sigma", format=",.2f", beside=True),
+        Column(INTERVAL, format=",.2f", key="interval", beside=True),
         Column("unit"),
     )
     note = (
@@ -171,9 +171,9 @@ def fit(result: Calibration) -> Table:
     """Return how well the readings fit."""
     unit = result.unit
     polished = [("cost L after polish", f"{result.cost:.9g}", f"({unit})^4")]
-    chance = result.noise_ratio is not None and [
-        ("residual noise / noise expected from the readings", f"{result.noise_ratio:.3g}", ""),
-        ("p-value", f"{result.noise_chance:.2g}", ""),
+    chance = result.residual_noise_ratio is not None and [
+        ("residual noise / noise expected from the readings", f"{result.residual_noise_ratio:.3g}", ""),
+        ("p-value", f"{result.residual_noise_p:.2g}", ""),
     ]
     rows = (
         ("rms of |f| - g before", f"{result.rms_before:.6g}", unit),
@@ -236,26 +236,28 @@ def worst_poses(result: Calibration) -> Table:
 
 def values(result: Calibration) -> Table:
     """Return one row per parameter, for CSV; one that is not determined has no value."""
-    lost = _undetermined(result)
+    lost = result.lost_entries
     names = [f"K_{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)] + ["D_1", "D_2", "D_3"]
     entries = (
         np.concatenate([result.K_a, [result.D_a]]),
         np.concatenate([result.sigma.K_a, [result.sigma.D_a]]),
+        np.concatenate([result.interval.K_a, [result.interval.D_a]]),
     )
     units_ = [f"output units per {result.unit}"] * 9 + ["output units"] * 3
     rows: list[tuple[object, ...]] = [
-        (name, None if gone else value, None if gone else sigma, unit)
-        for name, value, sigma, gone, unit in zip(
+        (name, *((None,) * 3 if gone else numbers), unit)
+        for name, *numbers, gone, unit in zip(
             names, *(e.ravel().tolist() for e in entries), lost.ravel().tolist(), units_, strict=True
         )
     ]
     rows += [
-        ("cost", result.cost, None, f"({result.unit})^4"),
-        ("rms", result.rms, None, result.unit),
-        ("g", result.g, None, result.unit),
-        ("verdict", result.verdict, None, ""),
+        ("cost", result.cost, None, None, f"({result.unit})^4"),
+        ("rms", result.rms, None, None, result.unit),
+        ("g", result.g, None, None, result.unit),
+        ("coverage_factor", result.coverage_factor, None, None, ""),
+        ("verdict", result.verdict, None, None, ""),
     ]
-    columns = (Column("parameter"), Column("value"), Column("sigma"), Column("unit"))
+    columns = (Column("parameter"), Column("value"), Column("sigma"), Column("interval"), Column("unit"))
     return Table("Calibration", columns, tuple(rows))
 
 
@@ -280,13 +282,12 @@ def pose_residuals(result: Calibration) -> Table:
 
 def accuracy(result: Calibration) -> str:
     """Say in one sentence how well the parameters are known; an empty text where the poses do not tell."""
-    variance = np.diagonal(result.covariance)
-    if result.verdict == "undetermined" or result.freedom < 1 or not np.isfinite(variance).all():
+    interval = result.interval_nine / result.g
+    if result.verdict == "undetermined" or not np.isfinite(interval).all():
         return ""
-    sigma = np.sqrt(variance) / result.g
-    largest = [(name, sigma[kind].max() * size, unit) for name, kind, unit, size in KINDS]
+    largest = [(name, interval[kind].max() * size, unit) for name, kind, unit, size in KINDS]
     parts = [f"{name} {v:{'.2g' if v < 100 else ',.0f'}} {unit}" for name, v, unit in largest if v > 0]
-    return f"Largest one-sigma of each kind: {', '.join(parts)}."
+    return f"Largest half of a 95 % interval of each kind: {', '.join(parts)}."
 
 
 def headline(result: Calibration) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ import numpy as np
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.fleet import FAILED, Fleet, Quantity, Standout, noise, parameters
 from accelcal_cli.calibration.observability import PARAMETERS
+from accelcal_cli.notices import Notice, in_one
 from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table
 
 SHOWN = 10
@@ -22,10 +23,20 @@ ADVICE = " Add these poses:"
 """Where the advice behind a reason begins, for which the summary has no room."""
 
 CLAUSE = re.compile(r"[:.] ")
-"""Where the first clause of a caution ends."""
+"""Where the first clause of a warning ends."""
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
-VERDICTS = ("good", "weak", "undetermined", FAILED)
+VERDICTS = ("good", "weak", "suspect", "undetermined", FAILED)
+
+
+class Cell(tuple[Notice, ...]):
+    """Notices as a cell: one text to people and in CSV, a list of records in JSON."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        """The notices, one behind the other."""
+        return in_one(self)
 
 
 def sensors(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout]) -> Table:
@@ -37,6 +48,7 @@ def sensors(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout]) 
         *((f"sigma_K_{i + 1}{j + 1}", fleet.sigma_k[:, i, j]) for i, j in entries),
         *((f"sigma_D_{i + 1}", fleet.sigma_d[:, i]) for i in range(3)),
         *((f"dop_{name.replace(' ', '_')}", fleet.dop[:, p]) for p, name in enumerate(PARAMETERS)),
+        ("coverage_factor", fleet.coverage),
         ("rms", fleet.rms),
         ("rms_before", fleet.rms_before),
         ("s", fleet.s),
@@ -53,22 +65,23 @@ def sensors(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout]) 
         Column("outlying poses", key="outlying_poses"),
         Column("stands out", key="stands_out"),
         Column("reason"),
-        Column("caution"),
+        Column("warnings"),
     )
+    said = [Cell(warnings) for warnings in fleet.warnings]
     lists = (
         [labels, fleet.verdict.tolist(), fleet.poses.tolist()]
         + [values.tolist() for _, values in numbers]
-        + [fleet.outlying.tolist(), names.tolist(), fleet.reason.tolist(), fleet.caution.tolist()]
+        + [fleet.outlying.tolist(), names.tolist(), fleet.reason.tolist(), said]
     )
     return Table("Sensors", columns, tuple(zip(*lists, strict=True)))
 
 
 def counts(fleet: Fleet) -> str:
-    """Return how many sensors there are of each verdict, and how many with a caution, in words."""
+    """Return how many sensors there are of each verdict, and how many with a note or a warning, in words."""
     each = {word: int((fleet.verdict == word).sum()) for word in VERDICTS}
     listed = ", ".join(f"{n:,} {word}" for word, n in each.items() if n)
-    warned = int((fleet.caution != "").sum())
-    warnings = f", {warned:,} of them with a caution" if warned else ""
+    warned = int(fleet.warned.sum())
+    warnings = f", {warned:,} of them with a note or a warning" if warned else ""
     return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{warnings}"
 
 
@@ -77,7 +90,7 @@ def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g
     shown: list[Block] = [Paragraph(heading=counts(fleet)), BLANK]
     if fleet.determined.any():
         shown += [_spread(fleet, g), _worst(fleet, labels, g)]
-    warned = np.flatnonzero(fleet.caution != "")
+    warned = np.flatnonzero(fleet.warned)
     if len(warned):
         shown.append(_warned(fleet, labels, warned, g))
     if standouts:
@@ -89,7 +102,7 @@ def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g
 
 
 def _spread(fleet: Fleet, g: float) -> Table:
-    """Return quantiles of parameters, fit and dilution of precision over the sensors with a verdict to use."""
+    """Return quantiles of parameters, fit and dilution of precision over the sensors that their poses determine."""
     known = fleet.determined
     unit = "g" if g == 1.0 else "m/s^2"
     quantities = [
@@ -107,7 +120,9 @@ def _spread(fleet: Fleet, g: float) -> Table:
             row = np.quantile(values, QUANTILES).tolist()
             rows.append((quantity.name, *(format(v, quantity.format) for v in row), quantity.unit))
     columns = ("quantity", "least", "5 %", "median", "95 %", "greatest", "unit")
-    note = "Scale factors, misalignments and biases in gauge lower, of the sensors that are good or weak."
+    note = (
+        "Scale factors, misalignments and biases in gauge lower, of the sensors that their poses determine."
+    )
     return Table("Fleet", tuple(Column(name) for name in columns), tuple(rows), (note,))
 
 
@@ -176,25 +191,38 @@ def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table
 
 
 def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table:
-    """Return the sensors with cautions, the noisiest first; of each its first caution in short."""
+    """Return the sensors with notes or warnings, the noisiest first; of each the first in short."""
     order = warned[np.argsort(-np.nan_to_num(fleet.s[warned]), kind="stable")][:SHOWN]
     rows = tuple(
-        (labels[r], 100.0 * float(fleet.s[r]) / g, fleet.outlying[r], CLAUSE.split(fleet.caution[r])[0])
+        (
+            labels[r],
+            100.0 * float(fleet.s[r]) / g,
+            fleet.outlying[r],
+            CLAUSE.split(fleet.warnings[r][0].text)[0],
+        )
         for r in order
     )
-    note = "s: standard deviation of one pose. Full sentences: column caution of --format csv."
+    note = "s: standard deviation of one pose. Full sentences: column warnings of --format csv."
     columns = (
         Column("sensor"),
         Column("s", "% of g", ".3g"),
         Column("outlying poses"),
-        Column("caution"),
+        Column("warning"),
     )
-    return Table("Cautions", columns, rows, (note, *_more(len(warned))))
+    return Table("Warnings", columns, rows, (note, *_more(len(warned))))
+
+
+def _why(fleet: Fleet, r: int) -> str:
+    """Return why a sensor is not good: what its poses leave open, else its first warning, in short."""
+    serious = [notice for notice in fleet.warnings[r] if notice.severity == "warning"]
+    if fleet.verdict[r] == "suspect" and serious:
+        return CLAUSE.split(serious[0].text)[0].rstrip(".")
+    return str(fleet.reason[r].partition(ADVICE)[0])
 
 
 def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
     """Return the sensors whose verdict is not good, the worst verdict first."""
     order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
-    rows = tuple((labels[r], fleet.verdict[r], fleet.reason[r].partition(ADVICE)[0]) for r in order[:SHOWN])
+    rows = tuple((labels[r], fleet.verdict[r], _why(fleet, r)) for r in order[:SHOWN])
     columns = (Column("sensor"), Column("verdict"), Column("why"))
     return Table("Not good", columns, rows, _more(len(bad)))

@@ -16,7 +16,7 @@ SHORT = {"scale": "scale", "misalignment": "misal.", "bias": "bias"}
 
 ALIGNED_NOTE = "Planned for scale factors and biases alone, as the poses so far were calibrated."
 
-SO_FAR = ("verdict", "reasons", "cautions")
+SO_FAR = ("verdict", "reasons", "warnings")
 """What a plan says of the calibration so far, as `calibrate` does."""
 
 
@@ -86,8 +86,8 @@ def blocks(plan: Plan) -> list[Block]:
     """Return what a plan shows: doubts about the poses so far, the poses to take, and what to expect of them."""
     known, expected = plan.so_far, parameter_table(plan)
     doubts: list[Block] = []
-    if known is not None and (known.cautions or plan.beyond_poses):
-        doubts = [Conclusion(known.verdict, known.reasons, known.cautions, "Verdict so far"), BLANK]
+    if known is not None and (known.warnings or plan.beyond_poses):
+        doubts = [Conclusion(known.verdict, known.reasons, known.warnings, "Verdict so far"), BLANK]
     more = [expected] if len(expected.columns) > 1 else []  # poses that determine nothing promise nothing
     return [*doubts, pose_table(plan), *more]
 

@@ -13,7 +13,7 @@ UNITS = ((-units.PPM, "ppm"), (-1000.0 * units.MRAD, "micro-rad"), (units.MICRO_
 
 def blocks(result: Verification) -> list[Block]:
     """Return what a verification shows: verdict first, then what it rests on."""
-    conclusion = Conclusion(result.verdict, result.reasons, result.cautions)
+    conclusion = Conclusion(result.verdict, result.reasons, result.warnings)
     return [conclusion, BLANK, differences(result), evidence(result)]
 
 

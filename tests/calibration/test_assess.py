@@ -1,7 +1,8 @@
-"""Cautions: what the residuals and the search say against a calibration whose poses determine it."""
+"""Warnings: what the residuals and the search say against a calibration whose poses determine it."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from dataclasses import replace
 
@@ -9,12 +10,13 @@ import numpy as np
 import pytest
 from simulated import DPSO, noise, readings
 
-from accelcal_cli.calibration import assess as cautions
+from accelcal_cli.calibration import assess
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.observability import design
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor import poses
 
 G = 9.8
@@ -22,22 +24,22 @@ FAST = Settings(optimizer="levenberg-marquardt", g=G)
 
 
 def _said(result, words):
-    return [words in caution for caution in result.cautions]
+    return [words in notice.text for notice in result.warnings]
 
 
 def test_an_honest_calibration_has_none():
-    assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).cautions == ()
-    assert calibrate(readings(poses.turns()), FAST).cautions == ()
+    assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).warnings == ()
+    assert calibrate(readings(poses.turns()), FAST).warnings == ()
 
 
 @pytest.mark.parametrize(("sigma", "expected"), [(0.02, False), (0.1, True)])
 def test_residuals_that_are_large_beside_g_are_told(sigma, expected):
-    """24 poses of 0.2 % and of 1 % of g: the verdict, which is of the poses, is good for both."""
+    """24 poses of 0.2 % and of 1 % of g: the poses are good for both, the calibration is not."""
     result = calibrate(readings(poses.turns(), sigma=sigma), FAST)
-    assert result.verdict == "good"
+    assert result.verdict == ("suspect" if expected else "good")
     assert any(_said(result, "of g (above 0.5%")) is expected
     if expected:
-        assert f"{result.s / G:.2%} of g" in result.cautions[0]
+        assert f"{result.s / G:.2%} of g" in result.warnings[0].text
 
 
 def test_random_numbers_are_told():
@@ -51,22 +53,27 @@ def test_poses_that_do_not_fit_are_named_by_line():
     errors = noise(24, 1e-3, 2)
     errors[7] += 0.03 * u[7]
     data = Readings.from_array(DPSO.output(G * u + errors))
-    (caution,) = calibrate(data, FAST).cautions
-    assert caution == (
+    (notice,) = calibrate(data, FAST).warnings
+    assert (notice.key, notice.severity) == ("outliers", "warning")
+    assert str(notice) == (
         "Outlier: pose 8 does not fit the other poses (p < 0.01). Measure it again or add --robust huber."
     )
-    (caution,) = calibrate(data, replace(FAST, robust="huber")).cautions
-    assert caution == "Outlier: pose 8 does not fit the other poses (p < 0.01). Measure it again."
+    result = calibrate(data, replace(FAST, robust="huber"))
+    (notice,) = result.warnings
+    assert (notice.key, notice.severity, result.verdict) == ("outliers", "note", "good")
+    assert str(notice) == (
+        "Outlier: pose 8 does not fit the other poses (p < 0.01). The robust loss counts it little. Measure it again."
+    )
 
 
 def test_many_poses_that_do_not_fit_are_not_all_named():
     names = [f"line {n}" for n in range(2, 14)]
-    (caution,) = cautions.not_fitting(names, 15)
-    assert caution == (
+    (notice,) = assess.not_fitting(names, 15)
+    assert str(notice) == (
         "Outliers: line 2, line 3, line 4, line 5, line 6, line 7, line 8, line 9 and 4 more do not fit the other "
         "poses (p < 0.01). Measure them again."
     )
-    assert cautions.not_fitting([], 15) == ()
+    assert assess.not_fitting([], 15) == ()
 
 
 def test_noise_that_moves_the_scale_factors_is_told():
@@ -78,16 +85,22 @@ def test_noise_that_moves_the_scale_factors_is_told():
     assert not any(_said(calibrate(readings(poses.turns(), sigma=0.02), FAST), "too large"))
 
 
-def test_cautions_of_readings_come_first():
-    data = replace(readings(poses.turns(), sigma=0.1), cautions=("These are no poses.",))
-    assert calibrate(data, FAST).cautions[0] == "These are no poses."
+def test_warnings_of_readings_come_first_and_make_a_result_suspect():
+    for severity, verdict in (("note", "good"), ("warning", "suspect")):
+        notice = Notice("log", severity, "These are no poses.")
+        result = calibrate(replace(readings(poses.turns(), sigma=1e-3), warnings=(notice,)), FAST)
+        assert (result.warnings[0], result.verdict) == (notice, verdict)
 
 
-def test_a_record_without_cautions_is_read():
+def test_what_the_poses_leave_open_is_undetermined_whatever_is_warned_of():
+    data = replace(readings(poses.faces(), sigma=1e-3), warnings=(Notice("log", "warning", "No poses."),))
+    assert calibrate(data, FAST).verdict == "undetermined"
+
+
+def test_warnings_come_back_from_a_record():
     record = calibrate(readings(poses.turns(), sigma=0.1), FAST).record()
-    assert Calibration.from_record(record, "r").cautions == tuple(record["cautions"]) != ()
-    del record["cautions"]
-    assert Calibration.from_record(record, "r").cautions == ()
+    said = Calibration.from_record(record, "r").warnings
+    assert [dataclasses.asdict(notice) for notice in said] == record["warnings"] != []
 
 
 @pytest.mark.parametrize("size", [0.5, 0.9, 0.95, 0.99, 1.05, 1.3, 2.0])
@@ -168,8 +181,8 @@ def test_a_reference_that_points_down_is_told():
 def test_dead_and_doubled_axes_and_copies_are_told(spoil, words):
     rows = DPSO.output(G * poses.turns() + noise(24, 1e-3, 2))
     spoil(rows)
-    told = Readings.from_array(rows).cautions
-    assert [words in caution for caution in told] == [True] if words else told == ()
+    told = Readings.from_array(rows).warnings
+    assert [words in notice.text for notice in told] == [True] if words else told == ()
 
 
 def _measured(seed, sigma, samples):
@@ -185,7 +198,7 @@ def _measured(seed, sigma, samples):
 def test_the_noise_of_forty_clean_sets_is_not_told_of():
     found = [calibrate(_measured(seed, 1e-2, 50), FAST) for seed in range(40)]
     assert not any(any(_said(result, "what the scatter within")) for result in found)
-    assert sum(result.noise_ratio > 1.0 for result in found) > 10
+    assert sum(result.residual_noise_ratio > 1.0 for result in found) > 10
 
 
 @pytest.mark.parametrize(
@@ -193,8 +206,8 @@ def test_the_noise_of_forty_clean_sets_is_not_told_of():
     [(1.9, 1e-9, False), (2.1, 1e-9, True), (5.0, 2e-3, False), (5.0, 5e-4, True), (np.nan, np.nan, False)],
 )
 def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio, chance, told):
-    said = cautions.more_than_noise(ratio, chance)
-    assert [f"{ratio:.2g} times what the scatter" in line for line in said] == [True] * told
+    said = assess.more_than_noise(ratio, chance)
+    assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
 
 
 @pytest.mark.parametrize("part", [0.05, 0.1])
@@ -203,28 +216,28 @@ def test_the_bias_that_is_stated_is_the_one_of_the_scale_factors(part):
     u = noise(40_000, 1.0, 3)
     u /= np.linalg.norm(u, axis=1)[:, None]
     result = calibrate(readings(u, sigma=part * G), FAST)
-    (caution,) = [line for line in result.cautions if "% too large" in line]
-    stated = float(re.search(r"about ([\d.]+)% too large", caution)[1])
+    (notice,) = [notice for notice in result.warnings if notice.key == "noise-bias"]
+    stated = float(re.search(r"about ([\d.]+)% too large", notice.text)[1])
     measured = 100 * np.mean(np.diagonal(result.K_a) / np.diagonal(DPSO.in_gauge("lower").K) - 1.0)
     assert stated == pytest.approx(measured, abs=0.05 + 0.06 * measured)
 
 
 def test_large_residuals_are_told_beyond_the_chance_of_their_estimate():
     """Twelve poses at 0.4 % of g, three degrees of freedom: an estimate in four is above 0.5 %, none is told."""
-    told = [calibrate(readings(poses.edges(), sigma=0.04, seed=seed), FAST).cautions for seed in range(100)]
-    assert sum(any("of g (above" in text for text in said) for said in told) <= 3
-    told = [calibrate(readings(poses.turns(), sigma=0.2, seed=seed), FAST).cautions for seed in range(20)]
-    assert all(any("of g (above" in text for text in said) for said in told)
+    told = [calibrate(readings(poses.edges(), sigma=0.04, seed=seed), FAST).warnings for seed in range(100)]
+    assert sum(any("of g (above" in notice.text for notice in said) for said in told) <= 3
+    told = [calibrate(readings(poses.turns(), sigma=0.2, seed=seed), FAST).warnings for seed in range(20)]
+    assert all(any("of g (above" in notice.text for notice in said) for said in told)
 
 
 def test_poses_that_stand_in_for_each_other_are_said_to():
     """Of twelve edges the opposite one takes the blame, too."""
     force = G * poses.edges() + noise(12, 1e-3, 2)
     force[4] *= 1.05
-    (caution,) = (
-        text
-        for text in calibrate(Readings.from_array(DPSO.output(force)), FAST).cautions
-        if "Outlier" in text
+    (notice,) = (
+        notice
+        for notice in calibrate(Readings.from_array(DPSO.output(force)), FAST).warnings
+        if notice.key == "outliers"
     )
-    assert "pose 5" in caution
-    assert caution.endswith("With so few poses one can take the blame of another.")
+    assert "pose 5" in notice.text
+    assert notice.text.endswith("With so few poses one can take the blame of another.")

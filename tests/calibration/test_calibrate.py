@@ -448,17 +448,19 @@ def test_scatter_within_poses_is_compared_with_the_fit():
     n = np.full(24, count)
     honest = Readings.from_array(DPSO.output(G * poses.turns() + noise_of_means), count=n, scatter=scatter)
     result = calibrate(honest, FAST)
-    assert result.noise_ratio == pytest.approx(1.0, abs=0.5)
-    assert result.noise_chance > 0.01
-    assert result.cautions == ()
+    assert result.residual_noise_ratio == pytest.approx(1.0, abs=0.5)
+    assert result.residual_noise_p > 0.01
+    assert result.warnings == ()
     wrong = Readings.from_array(
         DPSO.output(G * poses.turns() + 20 * noise_of_means), count=n, scatter=scatter
     )
     result = calibrate(wrong, FAST)
-    assert result.noise_ratio > 10
-    assert result.noise_chance < 1e-6
-    assert any(f"residuals are {result.noise_ratio:.2g} times" in caution for caution in result.cautions)
-    assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).noise_ratio is None
+    assert result.residual_noise_ratio > 10
+    assert result.residual_noise_p < 1e-6
+    assert any(
+        f"residuals are {result.residual_noise_ratio:.2g} times" in notice.text for notice in result.warnings
+    )
+    assert calibrate(readings(poses.turns(), sigma=1e-3), FAST).residual_noise_ratio is None
 
 
 def test_searches_that_stop_at_different_costs_do_not_agree():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from accelcal_cli.calibration.distributions import Noise, Pair, combined, holm
+from accelcal_cli.calibration.distributions import Noise, Pair, combined, holm, student_quantile
 from accelcal_cli.calibration.observability import design
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
@@ -79,3 +79,15 @@ def test_unchanged_sensors_are_called_changed_as_often_as_the_level_says(old, ne
         single = [pair.chance(d[j, [p]], A[[p]][:, [p]], B[[p]][:, [p]]) for p in range(9)]
         hits += combined(np.array([*single, pair.chance(d[j], A, B)])) < 0.05
     assert 0.025 <= hits / count <= 0.075
+
+
+@pytest.mark.parametrize("probability", [0.025, 0.5, 0.6, 0.9, 0.975, 0.995, 0.9995])
+def test_the_student_quantile_is_that_of_scipy(probability):
+    for freedom in (1, 1.3, 2, 2.7, 3, 5, 9.9, 15, 30, 99.5, 150, 199, 201, 250, 1000, 1e4, 1e6, 1e8):
+        expected = stats.t.ppf(probability, freedom)
+        assert student_quantile(probability, freedom) == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+def test_there_is_no_quantile_below_one_degree_of_freedom():
+    with pytest.raises(ValueError, match="expected 1 or more"):
+        student_quantile(0.975, 0.5)

@@ -47,6 +47,14 @@ SCHEMES = {
 """Good, weak, undetermined and useless sets of poses, of many lengths."""
 
 
+def said_of(notices):
+    """What is said, whatever the rows and the files are called."""
+    return [
+        (one.key, one.severity, LINE.sub("", one.text), re.sub(r"\S+\.csv", "", one.remedy))
+        for one in notices
+    ]
+
+
 def rows_of(u, number, sigma=0.01):
     """Return the readings of drawn sensor `number` in directions u, shape (J, 3)."""
     model = draw(TYPE, [number], 4)
@@ -118,7 +126,7 @@ def test_every_sensor_is_calibrated_as_if_it_were_alone(mixed, tmp_path, setting
         assert fleet.poses[r] == one.poses
         words = " ".join(one.reasons)
         assert fleet.reason[r].split(" Poses that")[0].split(" The least cost")[0] in words
-        assert LINE.sub("", fleet.caution[r]) == LINE.sub("", " ".join(one.cautions))
+        assert said_of(fleet.warnings[r]) == said_of(one.warnings)
         dop = np.array(list(one.dop.parameters.values()))
         if one.verdict == "undetermined":
             np.testing.assert_array_equal(np.isinf(fleet.dop[r]), np.isinf(dop))
@@ -148,7 +156,7 @@ def test_the_whole_records_are_those_of_calibrate(mixed, tmp_path):
     kept = {}
     fleet = calibrate_fleet(readings, LM, lambda number, record: kept.setdefault(number, record))
     assert sorted(kept) == [r for r in range(len(readings.sensors)) if fleet.verdict[r] != FAILED]
-    assert all(fleet.caution[number] == " ".join(record.cautions) for number, record in kept.items())
+    assert all(fleet.warnings[number] == record.warnings for number, record in kept.items())
     r = readings.sensors.index("turns/0.001")
     alone = tmp_path / "alone.csv"
     alone.write_text(
@@ -202,7 +210,7 @@ def test_weights_are_those_of_calibrate(tmp_path, weights):
         np.testing.assert_allclose(fleet.K_a[r], one.K_a, rtol=1e-9, atol=1e-7)
         np.testing.assert_allclose(fleet.sigma_k[r], one.sigma.K_a, rtol=1e-7)
         np.testing.assert_allclose(kept[r].s, one.s, rtol=1e-7)
-        np.testing.assert_allclose(kept[r].noise_ratio, one.noise_ratio, rtol=1e-7)
+        np.testing.assert_allclose(kept[r].residual_noise_ratio, one.residual_noise_ratio, rtol=1e-7)
     assert not np.allclose(fleet.K_a[0], calibrate_fleet(readings, LM).K_a[0], rtol=1e-9)
 
 
@@ -335,36 +343,35 @@ def clipped(tmp_path_factory):
     return read_fleet([path]), tables
 
 
-def test_a_broken_sensor_has_the_cautions_of_calibrate(clipped, tmp_path):
+def test_a_broken_sensor_has_the_warnings_of_calibrate(clipped, tmp_path):
     readings, tables = clipped
     kept = {}
     fleet = calibrate_fleet(readings, LM, lambda number, record: kept.setdefault(number, record))
-    assert set(fleet.verdict) == {"good"}
-    assert [readings.sensors[r] for r in np.flatnonzero(fleet.caution != "")] == ["S07", "S12"]
+    assert set(fleet.verdict) == {"good", "suspect"}
+    assert [readings.sensors[r] for r in np.flatnonzero(fleet.warned)] == ["S07", "S12"]
+    assert [readings.sensors[r] for r in np.flatnonzero(fleet.verdict == "suspect")] == ["S07", "S12"]
     for r, label in ((7, "S07"), (12, "S12")):
         alone = tmp_path / "alone.csv"
         alone.write_text("ax,ay,az\n" + "\n".join(",".join(map(repr, row)) for row in tables[label].tolist()))
         one = calibrate(read_readings(alone), LM)
-        assert one.cautions
-        assert [LINE.sub("", text) for text in kept[r].cautions] == [
-            LINE.sub("", text) for text in one.cautions
-        ]
-        assert fleet.caution[r] == " ".join(kept[r].cautions)
-    assert "Outlier: line 295 does not fit the other poses" in fleet.caution[12]
-    assert counts(fleet) == "30 sensors: 30 good, 2 of them with a caution"
+        assert one.warnings
+        assert said_of(kept[r].warnings) == said_of(one.warnings)
+        assert fleet.warnings[r] == kept[r].warnings
+    assert "Outlier: line 295 does not fit the other poses" in fleet.warnings[12][0].text
+    assert counts(fleet) == "30 sensors: 28 good, 2 suspect, 2 of them with a note or a warning"
     (table,) = [
-        t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table) and t.title == "Cautions"
+        t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table) and t.title == "Warnings"
     ]
     assert [row[0] for row in table.rows] == ["S07", "S12"]
     assert table.rows[0][1] == pytest.approx(100 * fleet.s[7] / G)
     assert table.rows[0][3] == "Residuals are too large"
     assert table.rows[1][2:] == ("line 295", "Outlier")
     rows = sensors(fleet, readings.sensors, []).records()
-    assert [row["sensor"] for row in rows if row["caution"]] == ["S07", "S12"]
+    assert [row["sensor"] for row in rows if row["warnings"]] == ["S07", "S12"]
 
 
 @pytest.mark.parametrize("header", ["pose,ax,ay,az", "ax,ay,az", "time,ax,ay,az", "ax,ay,az,n,sx,sy,sz"])
-def test_cautions_of_scatter_and_of_logs_are_those_of_calibrate(tmp_path, header):
+def test_warnings_of_scatter_and_of_logs_are_those_of_calibrate(tmp_path, header):
     """Samples of each pose that say less than its error; 600 rows that creep, or have times; counts and deviations."""
     u = np.repeat(poses.turns(), 25, axis=0)
     fine = {"S1": noise(600, 0.01, 1), "S2": noise(600, 0.01, 2), "S3": noise(600, 0.01, 3)}
@@ -391,9 +398,9 @@ def test_cautions_of_scatter_and_of_logs_are_those_of_calibrate(tmp_path, header
         alone = tmp_path / "alone.csv"
         alone.write_text("\n".join([header, *(row for own, row in cells if own == label)]))
         one = calibrate(read_readings(alone), LM)
-        said[label] = [LINE.sub("", text) for text in one.cautions]
-        assert [LINE.sub("", text) for text in kept[r].cautions] == said[label]
-        assert fleet.caution[r] == " ".join(kept[r].cautions)
+        said[label] = [notice.text for notice in one.warnings]
+        assert said_of(kept[r].warnings) == said_of(one.warnings)
+        assert fleet.warnings[r] == kept[r].warnings
     scattered = any("what the scatter within the poses explains" in text for text in said["S2"])
     assert scattered == (header[0] == "p" or header.endswith("sz"))
     logged = any("600 rows are a log" in text for text in said["S1"])
@@ -414,14 +421,14 @@ def test_doubtful_readings_are_told_as_calibrate_tells_them(tmp_path):
         fleet = calibrate_fleet(
             readings, settings, lambda number, record, kept=kept: kept.update({number: record})
         )
-        assert [readings.sensors[r] for r in np.flatnonzero(fleet.caution != "")] == told
-        assert all(fleet.caution[r] == " ".join(kept[r].cautions) for r in kept)
+        assert [readings.sensors[r] for r in np.flatnonzero(fleet.warned)] == told
+        assert all(fleet.warnings[r] == kept[r].warnings for r in kept)
         for word, at in (
             ('"ay" is 7 in every', 0),
             ('"ax" and "az" are equal', 1),
             ("8 of 24 poses repeat", 2),
         ):
-            assert word in fleet.caution[at]
+            assert word in fleet.warnings[at][0].text
 
 
 def test_a_few_sensors_are_no_fleet_to_stand_out_from(tmp_path):
@@ -454,7 +461,7 @@ def test_the_summary_tells_what_is_wrong(mixed):
     readings = read_fleet([path])
     fleet = calibrate_fleet(readings, LM)
     tables = {t.title: t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table)}
-    assert list(tables) == ["Fleet", "Worst fit", "Cautions", "Not good"]
+    assert list(tables) == ["Fleet", "Worst fit", "Warnings", "Not good"]
     first = tables["Not good"].rows[0]
     assert first[1] == FAILED
     assert "only one pose" in first[2] or "equal" in first[2]

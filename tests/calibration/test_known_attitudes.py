@@ -143,7 +143,7 @@ def test_how_the_sensor_lies_in_the_body_does_not_matter(turn):
     found = calibrate(Readings.from_array(plain.output(), reference=G * TWELVE @ turn), KNOWN)
     np.testing.assert_allclose(found.K_a @ turn.T, straight.K_a, atol=1e-12)
     np.testing.assert_array_equal(found.nominal_scale, straight.nominal_scale)
-    assert found.cautions == straight.cautions == ()
+    assert found.warnings == straight.warnings == ()
     assert found.rms_before == pytest.approx(straight.rms_before)
     for row, other in zip(engineering(found).rows, engineering(straight).rows, strict=True):
         np.testing.assert_allclose([row[1], row[2]], [other[1], other[2]], rtol=1e-6)
@@ -154,10 +154,10 @@ def test_how_the_sensor_lies_in_the_body_does_not_matter(turn):
     np.testing.assert_allclose(np.diagonal(record["K_a"]), np.linalg.norm(MEMS.K, axis=1), rtol=1e-3)
 
 
-def test_a_reference_that_points_down_is_cautioned():
+def test_a_reference_that_points_down_is_noted():
     plain = known()
     found = calibrate(Readings.from_array(plain.output(), reference=-G * TWELVE), KNOWN)
-    assert "counts gravity instead of specific force" in found.cautions[0]
+    assert "counts gravity instead of specific force" in found.warnings[0].text
 
 
 @pytest.mark.parametrize("value", [0.1, 3.0])

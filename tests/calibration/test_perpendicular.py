@@ -45,7 +45,7 @@ def test_six_faces_determine_scale_factors_and_biases(optimizer):
     )
     assert result.dop.scale == pytest.approx(np.sqrt(0.5), rel=1e-2)
     assert result.dop.misalignment == 0
-    assert any("taken as perpendicular" in caution for caution in result.cautions)
+    assert any("taken as perpendicular" in notice.text for notice in result.warnings)
     assert Calibration.from_record(result.record(), "r").held.sum() == 3
 
 

@@ -23,6 +23,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.cli.export import command
 from accelcal_cli.errors import UsageError
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+from accelcal_cli.notices import Notice
 
 READING = np.array([[0.3, -4.0, 8.9], [1.0, 9.7, -0.2], [-5.0, 5.0, -6.0]])
 """Readings of a sensor in m/s^2, shape (3, 3)."""
@@ -122,7 +123,7 @@ def is_text_unless_binary(cls: type[Exporter], result: Calibration) -> None:
 
 def names_its_origin(cls: type[Exporter], result: Calibration) -> None:
     """Version, verdict and the sha256 of the readings stand in the file, and what speaks against the numbers."""
-    doubtful = dataclasses.replace(result, cautions=("The sensor moved.",))
+    doubtful = dataclasses.replace(result, warnings=(Notice("residuals", "warning", "The sensor moved."),))
     content = cls().export(doubtful).content
     parts = (
         result.data["sha256"],

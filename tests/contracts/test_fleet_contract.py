@@ -27,8 +27,8 @@ SENSORS = 300
 WEIGHTS = ("none", "n", "sd")
 """A third of the sensors each."""
 
-SENTENCES = ("verdict", "reasons", "suggestions", "cautions", "outliers", "before", "freedom", "poses")
-NUMBERS = ("K_a", "D_a", "rms", "rms_before", "s", "noise_ratio", "noise_chance")
+SENTENCES = ("verdict", "reasons", "suggestions", "warnings", "outliers", "before", "freedom", "poses")
+NUMBERS = ("K_a", "D_a", "rms", "rms_before", "s", "residual_noise_ratio", "residual_noise_p")
 RELATIVE = 1e-9
 ABSOLUTE = 1e-12
 """In units of g: what two ways of rounding may make of a residual that is 0."""
@@ -153,7 +153,7 @@ def differences(fleet: Calibration | str, alone: Calibration | str) -> list[str]
     units = {"K_a": scale, "D_a": scale * G, "sigma K_a": scale, "sigma D_a": scale * G}
     exact = max(fleet.s, alone.s) < ABSOLUTE * G  # no noise: its ratio to the expected one is rounding
     for name, (x, y) in _numbers(fleet, alone).items():
-        if exact and name.startswith("noise"):
+        if exact and name.startswith("residual_noise"):
             continue
         # Parameters that are 0 in truth are compared as parts of their matrix.
         part = RELATIVE * units[name] if name in ("K_a", "D_a") else 0.0

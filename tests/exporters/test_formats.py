@@ -18,6 +18,7 @@ from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, UsageError
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import read_readings
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
@@ -118,10 +119,10 @@ def test_a_driver_scale_of_other_readings_is_refused(counts, name, driver_scale)
         export(counts, name, driver_scale=driver_scale)
 
 
-def test_cautions_stand_in_the_comments(metres):
-    doubtful = dataclasses.replace(metres, cautions=("The sensor moved.",))
+def test_warnings_stand_in_the_comments(metres):
+    doubtful = dataclasses.replace(metres, warnings=(Notice("residuals", "warning", "The sensor moved."),))
     for name in ("px4", "ardupilot", "kalibr", "ros", "c-header"):
-        assert "caution: The sensor moved." in text(export(doubtful, name))
+        assert "warning: The sensor moved." in text(export(doubtful, name))
 
 
 def test_the_symmetric_gauge_halves_what_an_autopilot_drops(metres):

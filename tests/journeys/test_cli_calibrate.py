@@ -20,11 +20,13 @@ CONTRACT = {
     "f_0": (3,),
     "gauge": str,
     "sigma": dict,
+    "interval": dict,
+    "coverage_factor": (*NUMBER, type(None)),
     "dop": dict,
     "verdict": str,
     "reasons": list,
     "suggestions": list,
-    "cautions": list,
+    "warnings": list,
     "cost_search": NUMBER,
     "cost": NUMBER,
     "rms": NUMBER,
@@ -32,12 +34,13 @@ CONTRACT = {
     "before": str,
     "s": NUMBER,
     "freedom": int,
-    "noise_ratio": (*NUMBER, type(None)),
-    "noise_chance": (*NUMBER, type(None)),
+    "residual_noise_ratio": (*NUMBER, type(None)),
+    "residual_noise_p": (*NUMBER, type(None)),
     "covariance": (9, 9),
     "nominal_scale": (3,),
     "nominal_bias": (3,),
     "poses": int,
+    "attitudes": (int, type(None)),
     "evaluations": int,
     "runs": int,
     "runs_agreeing": int,
@@ -69,7 +72,7 @@ def truth(run, *arguments):
 
 def test_json_keeps_its_contract(run, good):
     result = record(run, good)
-    assert result["schema"] == SCHEMA == "accelcal/calibration/1"
+    assert result["schema"] == SCHEMA == "accelcal/calibration/2"
     assert set(CONTRACT) <= set(result)
     for name, expected in CONTRACT.items():
         if isinstance(expected, tuple) and isinstance(expected[0], int):
@@ -195,7 +198,7 @@ def test_repeated_readings_are_averaged_and_judged(run):
     truth(run, "--sensor", "mems", "--positions", "24", "--samples", "50")
     result = record(run, "data.csv", "--weights", "sd")
     assert result["poses"] == 24
-    assert 0.5 < result["noise_ratio"] < 1.6  # 15 degrees of freedom
+    assert 0.5 < result["residual_noise_ratio"] < 1.6  # 15 degrees of freedom
     assert run("calibrate", "data.csv", "--weights", "sd", "-o", "result.yaml").code == 0
     assert load_mapping(Path("result.yaml")) == result
 
@@ -249,16 +252,16 @@ def test_readings_in_g_that_are_compared_with_metres_are_told(run, good):
     assert "--g 1" not in run("calibrate", good, *fast).err
 
 
-def test_cautions_stand_under_the_verdict_and_go_with_the_result(run):
+def test_warnings_stand_under_the_verdict_and_go_with_the_result(run):
     run("simulate", "--positions", "24", "--noise", "0.1", "--seed", "1", "-o", "noisy.csv")
     shown = run("calibrate", "noisy.csv", "--optimizer", "ellipsoid", "-o", "noisy.yaml", "--quiet")
     first, second, *_ = shown.out.splitlines()
-    assert (first, shown.code, shown.err) == ("Verdict: good", 0, "")
-    assert second.startswith("Caution: Residuals are too large")
-    said = "accelcal: noisy.csv: caution: Residuals are too large"
+    assert (first, shown.code, shown.err) == ("Verdict: suspect", 1, "")
+    assert second.startswith("Warning: Residuals are too large")
+    said = "accelcal: noisy.csv: warning: Residuals are too large"
     for form in ("csv", "json"):
         assert said in run("calibrate", "noisy.csv", "--optimizer", "ellipsoid", "--format", form).err
-    said = "accelcal: noisy.yaml: caution: Residuals are too large"
+    said = "accelcal: noisy.yaml: warning: Residuals are too large"
     assert run("export", "noisy.yaml", "--to", "imucal").err.startswith(said)
     assert run("apply", "noisy.yaml", "noisy.csv", "-o", "forces.csv").err.startswith(said)
     assert run("export", "noisy.yaml", "--to", "imucal", "--quiet").err == ""

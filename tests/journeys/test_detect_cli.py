@@ -71,11 +71,11 @@ def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
     assert said in plain.out.replace("\n", " ")
     assert said not in run("calibrate", log, "--raw", "--optimizer", "ellipsoid").out.replace("\n", " ")
     verified = run("verify", "wrong.yaml", log)
-    assert verified.err.startswith(f"accelcal: wrong.yaml: caution: {said}")
+    assert verified.err.startswith(f"accelcal: wrong.yaml: warning: {said}")
     for outcome in (verified, run("plan", log)):
-        assert f"\nCaution: {said}" in outcome.out
+        assert f"\nWarning: {said}" in outcome.out
         assert "raw.csv" not in outcome.err
-    assert run("plan", log, "--format", "csv").err.startswith(f"accelcal: raw.csv: caution: {said}")
+    assert run("plan", log, "--format", "csv").err.startswith(f"accelcal: raw.csv: warning: {said}")
     assert run("detect", log, "-o", "poses.csv").code == 0
     assert said not in run("calibrate", "poses.csv", "--optimizer", "ellipsoid").out.replace("\n", " ")
     assert run("plan", "poses.csv", "--format", "csv").err == ""
@@ -86,7 +86,7 @@ def test_a_raw_log_without_names_is_told_too_and_many_poses_are_not(run, log):
     said = "Each row is taken for a pose at rest. If these"
     Path("bare.csv").write_text(bare)
     assert run("plan", "bare.csv", "--columns", "1,2,3", "--format", "csv").err.startswith(
-        f"accelcal: bare.csv: caution: {said}"
+        f"accelcal: bare.csv: warning: {said}"
     )
     run("simulate", "--sensor", "mems", "--positions", "600", "-o", "poses.csv")
     assert run("plan", "poses.csv", "--format", "csv").err == ""

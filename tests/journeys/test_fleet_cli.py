@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from accelcal_cli.calibration.result import load_result
+from accelcal_cli.notices import Notice, in_one
 
 
 @pytest.fixture
@@ -202,22 +203,21 @@ def test_a_missed_tolerance_is_named(run, table):
 
 
 def test_a_broken_sensor_is_told_in_every_form(run):
-    """The x axis of one stops at half of g; the exit code is of the verdict."""
+    """The x axis of one stops at half of g; it is suspect."""
     text = run("simulate", "--sensor", "mems", "--sensors", "20", "--positions", "24").out
     lines = [line.split(",") for line in text.splitlines()]
     rows = [[a, repr(min(float(x), 9000.0)) if a == "S07" else x, y, z] for a, x, y, z in lines[1:]]
     Path("cut.csv").write_text("\n".join(map(",".join, [lines[0], *rows])))
     shown = run("fleet", "cut.csv", "-q")
-    assert (shown.code, shown.err) == (0, "")
-    assert shown.out.startswith("20 sensors: 20 good, 1 of them with a caution\n")
-    assert "\nCautions\n" in shown.out
+    assert (shown.code, shown.err) == (1, "accelcal: 1 of 20 sensors suspect: S07\n")
+    assert shown.out.startswith("20 sensors: 19 good, 1 suspect, 1 of them with a note or a warning\n")
+    assert "\nWarnings\n" in shown.out
     by_csv = rows_of(run("fleet", "cut.csv", "-q", "--format", "csv").out)
     by_json = json.loads(run("fleet", "cut.csv", "-q", "--format", "json", "-o", "results/").out)
-    assert {row["sensor"]: row["caution"] for row in by_json} == {
-        k: row["caution"] for k, row in by_csv.items()
-    }
-    assert [label for label, row in by_csv.items() if row["caution"]] == ["S07"]
-    assert by_csv["S07"]["caution"] == " ".join(load_result("results/S07.json").cautions)
+    said = {row["sensor"]: " ".join(str(Notice(**one)) for one in row["warnings"]) for row in by_json}
+    assert said == {label: row["warnings"] for label, row in by_csv.items()}
+    assert [label for label, row in by_csv.items() if row["warnings"]] == ["S07"]
+    assert by_csv["S07"]["warnings"] == in_one(load_result("results/S07.json").warnings)
 
 
 def test_gravity_gauge_and_configuration(run, table):

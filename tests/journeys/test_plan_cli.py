@@ -87,8 +87,8 @@ def test_what_calibrate_says_of_the_poses_so_far_is_carried_on(run, tmp_path):
     done = run("plan", "r.csv", "--add", "2", "--format", "json")
     record = json.loads(done.out)
     assert (done.code, record["verdict"]) == (1, "undetermined")
-    assert record["so_far"] == {key: said[key] for key in ("verdict", "reasons", "cautions")}
-    assert "r.csv: caution: Residuals are too large" in done.err
+    assert record["so_far"] == {key: said[key] for key in ("verdict", "reasons", "warnings")}
+    assert "r.csv: warning: Residuals are too large" in done.err
     assert run("plan", "r.csv", "--add", "2", "--format", "json", "-q").err == ""
     shown = run("plan", "r.csv", "--add", "2")
     assert (shown.code, shown.err) == (1, "")

@@ -96,16 +96,19 @@ def test_readings_that_cannot_tell_fail(run, result, other):
     assert (shown.code, shown.err) == (1, "")
     assert shown.out.startswith("Verdict: inconclusive\n")
     assert (
-        "Caution: Outlier: line 5 does not fit the other poses (p < 0.01). Measure it again.\n" in shown.out
+        "Warning: Outlier: line 5 does not fit the other poses (p < 0.01). Measure it again.\n" in shown.out
     )
     plain = run("verify", result, "wrong.csv", "--format", "json")
     record = json.loads(plain.out)
     assert (plain.code, record["verdict"]) == (1, "inconclusive")
-    assert plain.err == "".join(f"accelcal: wrong.csv: caution: {text}\n" for text in record["cautions"])
-    assert run("calibrate", "wrong.csv", "--g", G, "-o", "wrong.yaml", "-q").code == 0
+    assert plain.err == "".join(
+        f"accelcal: wrong.csv: warning: {notice['text']} {notice['remedy']}\n"
+        for notice in record["warnings"]
+    )
+    assert run("calibrate", "wrong.csv", "--g", G, "-o", "wrong.yaml", "-q").code == 1
     back = run("verify", "wrong.yaml", other)
     assert back.code == 1
-    assert "accelcal: wrong.yaml: caution: Residuals are too large" in back.err
+    assert "accelcal: wrong.yaml: warning: Residuals are too large" in back.err
     assert run("verify", "wrong.yaml", other, "-q").err == ""
 
 
@@ -167,7 +170,7 @@ def test_a_log_in_another_unit_is_told(run, result, log):
     in_g = [[row[0], *(f"{float(cell) / 4000:.6f}" for cell in row[1:4]), *row[4:]] for row in rows[1:]]
     Path("in_g.csv").write_text("\n".join(",".join(row) for row in [rows[0], *in_g]) + "\n")
     told = run("apply", result, "in_g.csv", "-o", "out.csv").err
-    assert told.startswith("accelcal: in_g.csv: caution: The first readings come out as ")
+    assert told.startswith("accelcal: in_g.csv: warning: The first readings come out as ")
     assert run("apply", result, "in_g.csv", "-o", "out.csv", "-q").err == ""
 
 
@@ -283,8 +286,8 @@ FILES = {
     "list.yaml": "- 1\n- 2\n",
     "empty.yaml": "",
     "other.json": '{"schema": "accelcal/verification/1"}',
-    "broken.json": '{"schema": "accelcal/calibration/1", ',
-    "nothing.yaml": "schema: accelcal/calibration/1\n",
+    "broken.json": '{"schema": "accelcal/calibration/2", ',
+    "nothing.yaml": "schema: accelcal/calibration/2\n",
     "latin.yaml": b"schema: \xe9\n",
     "nan.csv": "t,ax,ay,az\n0,1,2,3\n1,2,nan,4\n",
     "word.csv": "t,ax,ay,az\n0,1,2,3\n1,2,x,4\n",
@@ -300,7 +303,7 @@ BAD_RESULTS = {
     "truncated YAML": ("syntax.yaml", ["syntax.yaml, line 2"]),
     "a list": ("list.yaml", ["list.yaml", "expected keys and values"]),
     "empty": ("empty.yaml", ["empty.yaml", "expected keys and values"]),
-    "another record": ("other.json", ["other.json", "verification", "accelcal/calibration/1"]),
+    "another record": ("other.json", ["other.json", "verification", "accelcal/calibration/2"]),
     "truncated JSON": ("broken.json", ["broken.json, line 2, column 1"]),
     "no content": ("nothing.yaml", ["nothing.yaml", "missing: K_a"]),
     "not UTF-8": ("latin.yaml", ["latin.yaml", "UTF-8"]),

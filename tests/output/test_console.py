@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from accelcal_cli.notices import Notice
 from accelcal_cli.output.console import draw_curve, draw_curves, show
 from accelcal_cli.views.blocks import BLANK, Column, Conclusion, Convergence, Paragraph, Table, notes
 
@@ -46,14 +47,21 @@ def test_a_paragraph_with_an_indent_is_wrapped_in_line():
     assert drawn(Paragraph("aaa bbb ccc", indent=2), width=10) == "  aaa bbb\n  ccc\n"
 
 
-def test_a_conclusion_has_its_reasons_and_its_cautions():
-    text = drawn(Conclusion("weak", ["Because."], ["Look."], "Verdict so far"))
-    assert text == "Verdict so far: weak\n  Because.\nCaution: Look.\n"
+def test_a_conclusion_has_its_reasons_and_its_warnings():
+    text = drawn(
+        Conclusion(
+            "weak",
+            ["Because."],
+            [Notice("log", "warning", "Look.", "Do."), Notice("box", "note", "Fine.")],
+            "Verdict so far",
+        )
+    )
+    assert text == "Verdict so far: weak\n  Because.\nWarning: Look. Do.\nNote: Fine.\n"
 
 
-@pytest.mark.parametrize(("cautions", "code"), [((), "32"), (("But.",), "33")])
-def test_there_is_no_green_light_with_a_caution_under_it(cautions, code):
-    assert f"\x1b[1;{code}mgood" in drawn(Conclusion("good", (), cautions), color="standard")
+@pytest.mark.parametrize(("verdict", "code"), [("good", "32"), ("weak", "33"), ("suspect", "31")])
+def test_a_verdict_has_its_colour(verdict, code):
+    assert f"\x1b[1;{code}m{verdict}" in drawn(Conclusion(verdict, ()), color="standard")
 
 
 def test_a_table_has_units_and_aligned_numbers():

@@ -108,7 +108,7 @@ def test_the_verdict_comes_first(kind):
     result = _result(kind)
     text = re.sub(r"\s+", " ", Reader(_page(kind)).text)
     assert text.index(f"Verdict: {result.verdict}") < text.index("Parameters")
-    for sentence in (*result.reasons, *result.cautions, *result.notes, result.before):
+    for sentence in (*result.reasons, *map(str, result.warnings), *result.notes, result.before):
         assert typeset(sentence) in text
 
 
@@ -125,9 +125,9 @@ def test_a_page_holds_every_part(good):
         "Sensor 7",
         good.data["sha256"],
         f"accelcal {accelcal_cli.__version__}",
-        "accelcal/calibration/1",
+        "accelcal/calibration/2",
         f"{good.K_a[0, 0]:.8g}",
-        f"{good.sigma.D_a[2]:.2g}",
+        f"{good.interval.D_a[2]:.2g}",
         "scale factor error x",
         "misalignment yz",
         "population: 20",
@@ -160,13 +160,15 @@ def test_an_outlier_is_marked_in_both_pictures_of_poses():
 
 
 def test_the_verdict_says_how_well_the_parameters_are_known(good):
-    sigma = np.sqrt(np.diagonal(good.covariance)) / good.g * np.repeat([1e6, 1e3, 1e6], 3)
+    interval = (
+        good.coverage_factor * np.sqrt(np.diagonal(good.covariance)) / good.g * np.repeat([1e6, 1e3, 1e6], 3)
+    )
     said = re.search(
         r"scale ([\d.,]+) ppm, misalignment ([\d.,]+) mrad, bias ([\d.,]+) micro-g", _page("good")
     )
     largest = [float(value.replace(",", "")) for value in said.groups()]
-    np.testing.assert_allclose(largest, sigma.reshape(3, 3).max(axis=1), rtol=0.05)
-    assert "one-sigma" not in _page("undetermined")
+    np.testing.assert_allclose(largest, interval.reshape(3, 3).max(axis=1), rtol=0.05)
+    assert "Largest half of a 95 % interval" not in _page("undetermined")
 
 
 def test_units_have_raised_powers():
