@@ -18,12 +18,25 @@ from accelcal_cli.errors import ConfigError
 CONFIGS = Path(__file__).parent / "configs"
 """The shipped configurations, inside the installed package."""
 
+DEEPEST, MOST_VALUES = 50, 1_000_000
+"""Levels, and values with all aliases written out, of a YAML file at most: a result of 1000 poses has some 20,000."""
+
 if not CONFIGS.is_dir():  # a checkout keeps them beside the package
     CONFIGS = Path(__file__).parent.parent / "configs"
 
 
 class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A safe loader that refuses a key given twice: YAML itself would silently keep the last."""
+    """A safe loader that refuses a key given twice, which YAML would silently keep the last of, and bombs.
+
+    An alias stands for what it names, which may be an alias again: a page of them becomes gigabytes when it is written
+    or compared. Aliases and depth are bounded before anything is built.
+    """
+
+    def get_single_node(self) -> yaml.Node | None:
+        node: yaml.Node | None = super().get_single_node()
+        if node is not None:
+            _weigh(node, {}, 0)
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -35,6 +48,29 @@ class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignor
             seen.add(key)
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
+
+
+def _weigh(node: yaml.Node, known: dict[int, int], depth: int) -> int:
+    """Return how many values a node stands for with its aliases written out; too many, or too deep, is an error."""
+    if id(node) in known:
+        return known[id(node)]
+    if depth > DEEPEST:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"nested more than {DEEPEST} deep", node.start_mark
+        )
+    known[id(node)] = MOST_VALUES  # an alias of itself
+    children: list[yaml.Node] = []
+    if isinstance(node, yaml.MappingNode):
+        children = [part for pair in node.value for part in pair]
+    elif isinstance(node, yaml.SequenceNode):
+        children = node.value
+    weight = 1 + sum(_weigh(child, known, depth + 1) for child in children)
+    if weight > MOST_VALUES:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"its aliases stand for more than {MOST_VALUES:,} values", node.start_mark
+        )
+    known[id(node)] = weight
+    return weight
 
 
 def load_mapping(path: Path) -> dict[str, Any]:

@@ -157,7 +157,8 @@ def record(assessment: Assessment, at: int) -> Calibration:
 
 
 def _origin(readings: Readings) -> dict[str, object]:
-    return {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
+    named = {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
+    return {**named, **asdict(readings.form)}
 
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:

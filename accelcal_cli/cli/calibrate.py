@@ -105,6 +105,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
+    form: options.TextOptions,
     gravity: options.GravityOptions,
     config: Annotated[
         Path | None, options.in_input(help="YAML file: optimizer, its parameters, box, gauge, ...")
@@ -150,9 +151,14 @@ def command(
     if raw:
         if log.min_poses is None and not settings.misalignment:
             log = replace(log, min_poses=FACES)
-        readings = log.detect(data, columns, settings.g).readings()
+        readings = log.detect(
+            data, columns, lambda unit: local_g(settings, gravity, config, unit), form
+        ).readings()
     else:
-        readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+        readings = read_readings(
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
+        )
+    settings = replace(settings, g=local_g(settings, gravity, config, readings.form.unit))
     result = calibrate(readings, settings)
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():
@@ -179,6 +185,17 @@ def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Setting
             aligned = {**keys, **stated}.get("misalignment") is False
             stated.setdefault("weights", "n" if aligned else "auto")
     return load_settings(config, stated)
+
+
+def local_g(
+    settings: Settings, gravity: options.GravityOptions, config: Path | None, unit: str | None
+) -> float:
+    """Return local gravity in the unit of the readings; what the settings file states is taken as it is."""
+    from accelcal_cli.config import load_mapping
+
+    filed = config is not None and "g" in load_mapping(config) and gravity.stated() is None
+    own = None if filed else gravity.in_unit(unit)
+    return settings.g if own is None else own
 
 
 def _units_of_g(result: Calibration) -> str:

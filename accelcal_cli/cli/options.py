@@ -25,6 +25,7 @@ from accelcal_cli.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
+    from accelcal_cli.io.reader import ReadOptions
     from accelcal_cli.notices import Notice
     from accelcal_cli.views.blocks import Block, Table
 
@@ -190,6 +191,23 @@ class GravityOptions:
     latitude: Annotated[float | None, in_input(help="Degrees; gravity from WGS84 instead of --g.")] = None
     height: Annotated[float | None, in_input(help="Metres above the ellipsoid, with --latitude.")] = None
 
+    def in_unit(self, unit: str | None) -> float | None:
+        """Return the stated local gravity in the unit of the readings, g or mg; without one as `stated` does.
+
+        Where nothing was stated it is 1 g in units of g, which is as good as the 9.80665 of other readings. What --g
+        states is taken as it is: the user knows the unit.
+
+        Args:
+            unit: as the file states it, None where it does not.
+        """
+        from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
+
+        stated = self.stated()
+        if unit not in ("g", "mg") or self.g is not None:
+            return stated
+        size = OUTPUT_OF_1_G[unit]
+        return size if stated is None else stated * size / STANDARD_GRAVITY
+
     def stated(self) -> float | None:
         """Return the stated local gravity in m/s^2, or None when nothing was stated.
 
@@ -205,6 +223,41 @@ class GravityOptions:
         if self.g is not None:
             return check_gravity(self.g)
         return None if self.latitude is None else normal_gravity(self.latitude, self.height or 0.0)
+
+
+@dataclass(frozen=True)
+class TextOptions:
+    """What a user knows of the form of a text."""
+
+    skip_rows: Annotated[
+        int | None, in_input(help="Lines at the beginning that are not looked at.", min=0, metavar="N")
+    ] = None
+    skip_bad: Annotated[
+        bool | None,
+        in_input("--skip-bad", help="Leave out rows that cannot be read, up to 5 % of them."),
+    ] = None
+    line: Annotated[
+        str | None,
+        in_input(
+            help="What the lines of readings begin with, among lines of several kinds.",
+            show_default="found by their words",
+            metavar="PREFIX",
+        ),
+    ] = None
+    count: Annotated[
+        str | None,
+        in_input(
+            help="The column of counts of raw readings, or none.",
+            show_default="found by name",
+            metavar="COLUMN",
+        ),
+    ] = None
+
+    def read_options(self) -> ReadOptions:
+        """Return the options as the library takes them."""
+        from accelcal_cli.io.reader import ReadOptions
+
+        return ReadOptions(self.skip_rows or 0, bool(self.skip_bad), self.line, self.count)
 
 
 LARGEST_MULTIPLIER = 1e6
@@ -281,25 +334,38 @@ class DetectionOptions:
         in_log(help="Attitudes, 5 degrees apart, that must be found.", show_default="12", min=2),
     ] = None
 
-    def detect(self, data: str, columns: str | None, g: float, picture: bool = False) -> Detection:
+    def detect(
+        self,
+        data: str,
+        columns: str | None,
+        gravity: Callable[[str | None], float],
+        form: TextOptions,
+        picture: bool = False,
+    ) -> Detection:
         """Find the static poses of a raw log.
 
         Args:
             data: file, or - for standard input.
             columns: option --columns.
-            g: local gravity, m/s^2.
+            gravity: returns local gravity in the unit that the file states.
+            form: what is known of the form of a text.
             picture: keep what a picture of the log needs.
         """
         from accelcal_cli.detection.detect import detect
         from accelcal_cli.detection.rawlog import open_raw_log
 
         check_input(data)
-        settings = self._settings(g)
+        self._settings(1.0)  # refuses what is wrong before the file is read
         log = open_raw_log(
-            data, split_columns(columns), split_columns(self.gyro), self.time, stdin=sys.stdin.buffer
+            data,
+            split_columns(columns),
+            split_columns(self.gyro),
+            self.time,
+            stdin=sys.stdin.buffer,
+            options=form.read_options(),
         )
         try:
-            return detect(log, settings, picture)
+            return detect(log, self._settings(gravity(log.columns.unit)), picture)
         finally:
             log.close()
 

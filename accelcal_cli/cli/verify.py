@@ -22,6 +22,7 @@ def command(
             help="New static readings of the sensor; - is standard input.", rich_help_panel="Input"
         ),
     ],
+    form: options.TextOptions,
     columns: options.Columns = None,
     g: Annotated[
         float | None,
@@ -56,7 +57,9 @@ def command(
         raise UsageError(
             f"--g {g:g}: {result} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
         )
-    readings = read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer)
+    readings = read_readings(
+        data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
+    )
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():
         options.print_result(

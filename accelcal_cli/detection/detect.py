@@ -29,7 +29,7 @@ from accelcal_cli.detection.intervals import (
 from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, read_tiles
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.readings import InputForm, Readings
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
@@ -98,6 +98,7 @@ class Detection:
         rate: rows per second, Hz, or None; rows: the lengths used.
         level: what the multipliers apply to; multiplier: the one kept; candidates: all of them.
         intervals: the poses.
+        form: of the file.
         envelope: of the log, for a picture; None unless asked for.
     """
 
@@ -113,12 +114,13 @@ class Detection:
     intervals: Intervals
     settings: DetectSettings
     notes: tuple[str, ...]
+    form: InputForm
     envelope: Envelope | None = None
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
         return readings_of(self.intervals, self.source).known_as(
-            self.sha256, self.columns, (*self.notes, self.summary()), self.intervals.where
+            self.sha256, self.columns, (*self.notes, self.summary()), self.intervals.where, form=self.form
         )
 
     def summary(self) -> str:
@@ -177,6 +179,7 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         intervals=_combine(intervals, settings) if enough else intervals,
         settings=settings,
         notes=(*log.notes, *gaps),
+        form=replace(log.form, rows=tiles.rows, rate_hz=rate),
         envelope=envelope,
     )
     if not enough:
@@ -232,7 +235,14 @@ def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
 
 def readings_of(intervals: Intervals, source: str) -> Readings:
     """Return the intervals as readings: mean, count and scatter of each."""
-    return Readings.from_array(intervals.mean, source=source, count=intervals.n, scatter=intervals.scatter)
+    degrees = intervals.temperature
+    return Readings.from_array(
+        intervals.mean,
+        source=source,
+        count=intervals.n,
+        scatter=intervals.scatter,
+        temperature=None if degrees is None or np.isnan(degrees).all() else degrees,
+    )
 
 
 def explain_too_few(segmentation: Segmentation, count: CandidateThreshold, detection: Detection) -> str:

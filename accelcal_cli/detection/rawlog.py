@@ -19,6 +19,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.clock import UNITS, Clock, seconds_of_dates, unit_of
 from accelcal_cli.io.columns import RawColumns, choose_raw
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.readings import InputForm
 from accelcal_cli.io.vocabulary import parse_unit
 
 PROBE = 1000
@@ -122,6 +123,12 @@ class RawLog:
         return f"{self.name}, {self.where(row)}, column {column}"
 
     @property
+    def form(self) -> InputForm:
+        """How the log is written; its rows are those of the detection."""
+        table = self._table
+        return InputForm(table.source_format, 0, table.rows_skipped, self.clock.rate, self.columns.unit)
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the input, once all blocks have been read."""
         return self._table.sha256
@@ -134,10 +141,14 @@ class RawLog:
     def blocks(self) -> Iterator[Float]:
         """Yield the rows, block after block, in constant memory; time that goes back is a DataError.
 
-        Shape (B, k): acceleration (3), turning rate (3) where there is a gyroscope, time where there is one, as given.
+        Shape (B, k): acceleration (3), turning rate (3) where there is a gyroscope, temperature where there is one
+        (NaN where it is missing), time where there is one, as given.
         """
         timed = self.columns.time is not None
-        width, last = (6 if self.columns.gyro else 3) + timed, -np.inf
+        width, last = (
+            (6 if self.columns.gyro else 3) + (self.columns.temperature is not None) + timed,
+            -np.inf,
+        )
         for rows in chain(self._head, self._rows):
             numbers = rows.numbers[:, :width]
             if timed and len(numbers):

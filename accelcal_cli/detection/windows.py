@@ -218,17 +218,20 @@ class Tiles:
 
     Attributes:
         size: rows of a tile.
-        gyro, timed: whether the log has a gyroscope and time.
+        gyro, timed, warm: whether the log has a gyroscope, time and temperature.
         rows: rows of the log, those left out included.
         gaps: those of the time column.
     """
 
-    def __init__(self, size: int, gyro: bool, timed: bool, longest: float = math.inf) -> None:
+    def __init__(
+        self, size: int, gyro: bool, timed: bool, longest: float = math.inf, *, warm: bool = False
+    ) -> None:
         """Start without tiles; a step of the time column that is longer than `longest` is a gap."""
-        self.size, self.gyro, self.timed = size, gyro, timed
+        self.size, self.gyro, self.timed, self.warm = size, gyro, timed, warm
         self.gaps = Gaps(longest)
         self.rows = 0
-        self._store = RowStore(6 + 6 * gyro + 2 * timed, IN_MEMORY)
+        self.warm_at = 6 + 6 * gyro
+        self._store = RowStore(6 + 6 * gyro + warm + 2 * timed, IN_MEMORY)
         self._rest: Float | None = None
 
     @property
@@ -264,6 +267,8 @@ class Tiles:
             off = part - mean[:, None]
             out[:, at] = mean
             out[:, at + 3] = np.einsum("ij,ij->i", off, off)
+        if self.warm:
+            out[:, self.warm_at] = _known_mean(block[6 if self.gyro else 3].reshape(tiles, self.size))
         if self.timed:
             time = block[-1].reshape(tiles, self.size)
             out[:, -2], out[:, -1] = time[:, 0], time[:, -1]
@@ -284,10 +289,18 @@ class Tiles:
 def read_tiles(log: RawLog, lengths: RowLengths, envelope: Envelope | None = None) -> Tiles:
     """Read a log to its end and return its tiles."""
     gyro, timed = log.columns.gyro is not None, log.columns.time is not None
-    tiles = Tiles(lengths.tile, gyro, timed, longest_step(log.clock, lengths))
+    warm = log.columns.temperature is not None
+    tiles = Tiles(lengths.tile, gyro, timed, longest_step(log.clock, lengths), warm=warm)
     for rows in log.blocks():
         tiles.add(rows, envelope)
     return tiles
+
+
+def _known_mean(rows: Float) -> Float:
+    """Return the mean of each row without its NaN, shape (B,); NaN where there is nothing else."""
+    known = np.isfinite(rows)
+    total, count = np.where(known, rows, 0.0).sum(axis=1), known.sum(axis=1)
+    return np.asarray(np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0))
 
 
 @dataclass(frozen=True)

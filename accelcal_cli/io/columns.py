@@ -120,12 +120,11 @@ class RawColumns:
     notes: tuple[str, ...] = ()
 
     def selection(self) -> Selection:
-        """Return what to ask of the table: acceleration, gyroscope, time; dates as text."""
-        sensors, time = (*self.output, *(self.gyro or ())), _present(self.time)
-        needed = self.output
-        if self.dated:
-            return Selection(sensors, texts=time, needed=needed)
-        return Selection((*sensors, *time), needed=needed)
+        """Return what to ask of the table: acceleration, gyroscope, temperature, time; dates as text."""
+        warm = _present(self.temperature)
+        sensors, time = (*self.output, *(self.gyro or ()), *warm), _present(self.time)
+        texts, numbers = (time, sensors) if self.dated else ((), (*sensors, *time))
+        return Selection(numbers, frozenset(warm), texts, self.output, frozenset(warm))
 
 
 def choose(
@@ -158,8 +157,9 @@ def choose(
     if count is not None:
         roles.alone["count"] = [] if count.lower() == NONE else [find_column(table, count, "--count")]
     else:
-        roles.alone["count"], more = _true_counts(table, roles.alone["count"])
-        notes += more
+        if not roles.scatter:  # rows that state their scatter are means, whatever their count
+            roles.alone["count"], more = _true_counts(table, roles.alone["count"])
+            notes += more
     return _with_extras(table, output, roles, tuple(notes), sensor)
 
 
@@ -290,10 +290,13 @@ def choose_raw(
     if time is not None:
         clock = None if time.lower() == NONE else find_column(table, time, "--time")
         raw = replace(raw, guessed=False, doubtful="")
+    warm = None if raw.temperature in (*(turning or ()), clock) else raw.temperature
     used = (*raw.output, *(turning or ()), *_present(clock))
     if len(set(used)) < len(used):
         raise UsageError("--columns, --gyro, --time: a column is asked for twice")
-    return replace(raw, gyro=turning, time=clock, dated=clock is not None and _is_text(table, clock))
+    return replace(
+        raw, gyro=turning, time=clock, temperature=warm, dated=clock is not None and _is_text(table, clock)
+    )
 
 
 def _is_text(table: InputTable, clock: int) -> bool:
@@ -451,6 +454,8 @@ def _with_extras(
         free_triple(roles.gyro),
         unit_of_output(table, output),
     )
+    if columns.unit is not None:
+        notes = (*notes, f"the readings are in {columns.unit} by the file")
     used = (*_present(sensor, columns.label), *columns.extras)
     if names is not None and used:
         notes = (*notes, f"column{'s' * (len(used) > 1)} {listed(names, used)} found")
@@ -461,7 +466,7 @@ def _by_name(table: InputTable, wanted: Sequence[str] | None) -> RawColumns:
     """Go by the names of the columns, or, for a stated accelerometer, by what the names leave."""
     columns = choose(table, wanted)
     if table.names is not None:
-        kept = [note for note in columns.notes if "taken as x, y, z" in note]
+        kept = [note for note in columns.notes if "taken as x, y, z" in note or "by the file" in note]
         return RawColumns(
             columns.output,
             columns.names,

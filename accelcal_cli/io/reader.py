@@ -81,6 +81,7 @@ class Selection:
     gaps: frozenset[int] = frozenset()  # columns whose cells may be empty or nan
     texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
     needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
+    carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +308,7 @@ class CarefulParser:
     line: int = 0  # lines so far
     lenient: bool = False  # leave out broken rows
     passed: PassedLines = field(default_factory=PassedLines)
+    last: dict[int, float] = field(default_factory=dict)  # values of the columns that are carried on
 
     def parse(self, block: bytes) -> RowBlock:
         """Return the rows of a block of whole lines; the first wrong cell raises DataError."""
@@ -351,6 +353,9 @@ class CarefulParser:
         if self.dialect.header_line and self._is_header(cells):
             self.passed.headers.append(self.line)
             return None
+        for column in selection.carried:
+            if (value := to_number(cells[column], self.dialect.decimal_comma)) is not None:
+                self.last[column] = value
         if needed and not any(cells[column] for column in needed):
             self.passed.merged += 1
             return None
@@ -400,6 +405,8 @@ class CarefulParser:
         value = to_number(cell, self.dialect.decimal_comma)
         if value is not None and -LIMIT <= value <= LIMIT:
             return value
+        if not cell and column in self.last:
+            return self.last[column]
         if column in self.selection.gaps and (not cell or (value is not None and math.isnan(value))):
             return math.nan
         raise DataError(f"{self._place(column)}: {_describe_cell(cell, value, self.dialect.decimal_comma)}")

@@ -50,6 +50,24 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 Label = TypeVar("Label", bound=Hashable)
 
 
+@dataclass(frozen=True)
+class InputForm:
+    """How an input is written.
+
+    Attributes:
+        source_format: ``text, comma``, ``parquet``, ``array``, ...
+        rows: read, without those skipped; rows_skipped: broken ones left out.
+        rate_hz: rows per second of a log, None where it is unknown.
+        unit: of the readings as the file states it: g, mg, m/s^2 or counts; None where it does not.
+    """
+
+    source_format: str = "array"
+    rows: int = 0
+    rows_skipped: int = 0
+    rate_hz: float | None = None
+    unit: str | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Static readings of one sensor, one row per pose; rows with one label are averaged.
@@ -65,6 +83,7 @@ class Readings:
         temperature: shape (J,), as given, NaN where missing.
         notes: what the reader did that a user should know.
         warnings: why the readings may not be what they are taken for.
+        form: how the input is written.
     """
 
     source: str
@@ -80,6 +99,7 @@ class Readings:
     temperature: Float | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[Notice, ...] = ()
+    form: InputForm = InputForm()
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 
@@ -146,14 +166,16 @@ class Readings:
         notes: Sequence[str],
         where: Callable[[int], str],
         warnings: tuple[Notice, ...] | None = None,
+        form: InputForm | None = None,
     ) -> Self:
-        """Return the same poses as those of another input, with its warnings if stated."""
+        """Return the same poses as those of another input, with its warnings and its form if stated."""
         return replace(
             self,
             sha256=sha256,
             columns=columns,
             notes=tuple(notes),
             warnings=self.warnings if warnings is None else warnings,
+            form=self.form if form is None else form,
             _line=where,
         )
 
@@ -180,7 +202,10 @@ def read_readings(
             check_rows(table, collector.columns, rows)
             collector.add(rows)
         collector.notes[:0] = table.notes
-        return collector.readings(table.sha256, table.where)
+        form = InputForm(
+            table.source_format, collector.rows, table.rows_skipped, None, collector.columns.unit
+        )
+        return collector.readings(table.sha256, table.where, form)
     finally:
         table.close()
 
@@ -234,11 +259,13 @@ class Collector:
                     f"columns other than the readings are not used: more than {IN_MEMORY:,} poses"
                 )
 
-    def readings(self, sha256: str, where: Callable[[int], str] | None = None) -> Readings:
+    def readings(
+        self, sha256: str, where: Callable[[int], str] | None = None, form: InputForm | None = None
+    ) -> Readings:
         """Return the poses of all rows; DataError where they are too few or all the same.
 
         Args:
-            sha256: of the input; where: how to name a row (from 0) to the user.
+            sha256: of the input; where: how to name a row (from 0) to the user; form: how the input is written.
         """
         columns, means = self.columns, self._means
         extras: tuple[Float | None, Float | None, Float | None] = (None, None, None)
@@ -266,6 +293,7 @@ class Collector:
             temperature=None if others is None or columns.temperature is None else others[:, -1],
             notes=tuple(self.notes),
             warnings=(*log, *doubts(first, columns.names)),
+            form=InputForm(rows=self.rows) if form is None else form,
             _store=self.store,
             _line=where,
         )
