@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.errors import UsageError, did_you_mean
+from accelcal_cli.errors import UsageError, did_you_mean, visible
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
@@ -534,7 +534,7 @@ def print_result(
 def tell(notes: Iterable[str], quiet: bool = False) -> None:
     """Say something on standard error, a line each, unless quiet."""
     for note in () if quiet else notes:
-        typer.echo(f"accelcal: {note}", err=True)
+        typer.echo(visible(f"accelcal: {note}"), err=True)
 
 
 def tell_written(paths: Iterable[str | None], quiet: bool) -> None:

@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass, field, replace
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.preamble import AHEAD, LAYOUTS, Facts, find_layout, read_facts
+from accelcal_cli.io.preamble import AHEAD, LAYOUTS, Facts, find_layout, is_known, read_facts
 from accelcal_cli.io.stream import LONGEST_LINE
 from accelcal_cli.io.vocabulary import is_unit_row
 
@@ -265,7 +265,7 @@ def _names_of_comments(
                 continue
             if is_unit_row(cells) and units is None:
                 units = tuple(cells)
-            elif names is None:
+            elif names is None and is_known(cells):
                 names = tuple(cells)
             break
     return names, units

@@ -226,7 +226,7 @@ def _with_header(
             break
         block[k] = whole
     if not block:
-        wrong = first and _is_known(rows[first - 1]) and not any(is_number(cell) for cell in rows[first - 1])
+        wrong = first and is_known(rows[first - 1]) and not any(is_number(cell) for cell in rows[first - 1])
         return Layout(first, tuple(rows[first - 1]), first - 1) if wrong else Layout(first)
     units = [k for k in block if is_unit_row(block[k])]
     titles = [k for k in block if k not in units] or units
@@ -241,7 +241,8 @@ def _is_title(cells: Sequence[str], row: Sequence[str], width: int, is_number: C
     ended = len(cells) == width - 1 and not row[-1]  # rows with a separator at their end
     if not (fits(cells, width) or ended) or not any(cells):
         return False
-    return 2 * sum(is_number(cell) for cell in cells) < sum(bool(cell) for cell in cells)
+    numbers = sum(is_number(cell) for cell in cells)
+    return not numbers or (is_known(cells) and 2 * numbers < sum(bool(cell) for cell in cells))
 
 
 def _says(unit: str) -> bool:
@@ -253,7 +254,8 @@ def _score(names: Sequence[str]) -> int:
     return sum(bool(name) and (is_time(name) or describe(name).axis is not None) for name in names)
 
 
-def _is_known(names: Sequence[str]) -> bool:
+def is_known(names: Sequence[str]) -> bool:
+    """Return whether cells are names of columns, of which some say what they are."""
     return len(names) > 1 and _score(names) > 0
 
 
