@@ -165,7 +165,7 @@ def _is_row(
     if abs(len(cells) - width) > 1:
         return False
     filled = [is_number(cells[k]) for k in numeric if k < len(cells) and cells[k]]
-    return bool(filled) and 2 * sum(filled) >= len(filled)
+    return bool(filled) and (2 * sum(filled) >= len(filled) if fits(cells, width) else all(filled))
 
 
 def _first_row(rows: Sequence[Sequence[str]], alike: Sequence[bool], is_number: Callable[[str], bool]) -> int:

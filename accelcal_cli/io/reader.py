@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -49,6 +50,9 @@ NO_LABEL = "is empty; every row needs its label"
 
 MOST_BAD = 0.05
 """Part of the rows that --skip-bad leaves out at most."""
+
+_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->")
+"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``."""
 
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
 
@@ -292,8 +296,9 @@ def _understand(source: ByteSource, options: ReadOptions) -> tuple[LineFilter | 
 def _is_worded(dialect: Dialect) -> bool:
     """Return whether words stand between the numbers of a line rather than above them."""
     numbers = sum(looks_numeric(cell) for cell in dialect.first)
-    marked = bool(dialect.first) and dialect.first[0].endswith((":", "="))
-    return dialect.header_line == 0 and (numbers < 3 or marked)
+    cells = dialect.first if dialect.header_line == 0 else dialect.names or ()
+    marked = any(_MARKED.fullmatch(cell) for cell in cells)
+    return marked or (dialect.header_line == 0 and numbers < 3)
 
 
 @dataclass(eq=False)

@@ -31,6 +31,9 @@ SHOWN = 60
 FIRST = 12
 """Lines that show whether they are of several kinds."""
 
+_CLOCK = re.compile(r"(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?:\s*->)?(?![\w:])")
+"""The time that a terminal program writes before each line."""
+
 _LEAD = re.compile(r"[^\d\s]*[A-Za-z][^\d]*?(?=[-+.]?\d)")
 _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"']+")
 
@@ -121,6 +124,8 @@ def readings(
             text = " ".join(value for value in values if ":" not in value)
         elif text.startswith("#"):
             continue
+        else:
+            text = _CLOCK.sub("", text)
         reading = pick(text, columns)
         unread = 0 if reading is not None else unread + 1
         if reading is not None:
