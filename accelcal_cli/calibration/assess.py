@@ -19,6 +19,7 @@ from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Geometry
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.notices import Notice, Severity, are_serious
+from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -302,8 +303,8 @@ def _unfinished(agreeing: int, runs: int, left: float) -> tuple[Notice, ...]:
 
 
 def odd_gravity(g: float) -> tuple[Notice, ...]:
-    """Return a warning of a gravity, m/s^2 or 1 for units of g, that is not found on Earth."""
-    if g == 1.0 or EARTH[0] <= g <= EARTH[1]:
+    """Return a warning of a gravity, in m/s^2, g or mg, that is not found on Earth."""
+    if any(EARTH[0] <= g * STANDARD_GRAVITY / size <= EARTH[1] for size in OUTPUT_OF_1_G.values()):
         return ()
     text = (
         f"g = {g:g} is neither gravity on Earth, {EARTH[0]} to {EARTH[1]} m/s^2, nor 1, for readings in units of g: "
