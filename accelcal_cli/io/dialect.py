@@ -114,7 +114,8 @@ def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:
     units = layout.units
     if names is None:
         first = _without_tail(first)
-        names, units = _names_of_comments(remarks, separator, len(first))
+        names, remarked = _names_of_comments(remarks, separator, len(first))
+        units = units or remarked
         names = names or LAYOUTS.get((facts.device, len(first)))
     elif len(first) != len(names) or not first[-1]:
         names = tuple(_without_tail(list(names)))

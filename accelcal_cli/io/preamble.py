@@ -229,7 +229,9 @@ def _with_header(
         wrong = first and is_known(rows[first - 1]) and not any(is_number(cell) for cell in rows[first - 1])
         return Layout(first, tuple(rows[first - 1]), first - 1) if wrong else Layout(first)
     units = [k for k in block if is_unit_row(block[k])]
-    titles = [k for k in block if k not in units] or units
+    titles = [k for k in block if k not in units]
+    if not titles:  # the names stand in a comment
+        return Layout(first, units=tuple(block[max(units)]))
     header = max(titles, key=lambda k: (_score(block[k]), k))
     below = next((tuple(block[k]) for k in units if k > header and any(map(_says, block[k]))), None)
     names = _grouped(block.get(header - 1) if header - 1 in titles else None, block[header])
@@ -256,7 +258,7 @@ def _score(names: Sequence[str]) -> int:
 
 def is_known(names: Sequence[str]) -> bool:
     """Return whether cells are names of columns, of which some say what they are."""
-    return len(names) > 1 and _score(names) > 0
+    return len(names) > 1 and _score(names) > 1
 
 
 def _grouped(groups: Sequence[str] | None, names: Sequence[str]) -> Sequence[str]:
