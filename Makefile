@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_NO_DEPS PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION
 unexport PIP_IGNORE_INSTALLED PIP_PYTHON PIP_REPORT PYTHONPATH PYTHONHOME
 
-.PHONY: help demo test hunt lint types bench docs golden pictures clean
+.PHONY: help demo test hunt lint types bench docs truth golden pictures clean
 .DELETE_ON_ERROR:
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo "make lint     ruff"
 	@echo "make types    mypy"
 	@echo "make bench    run the benchmarks; ARGS=optimizers only those of the optimizers"
+	@echo "make truth    is a good result good? traps, coverage, weights, robust losses, verification: hours"
 	@echo "make docs     write the tables and outputs in the documentation anew"
 	@echo "make golden   write the frozen outputs of the commands anew"
 	@echo "make pictures draw the pictures of the optimizers anew"
@@ -44,6 +45,9 @@ types: $(VENV)/installed-lint
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m benchmarks $(ARGS)
+
+truth: $(VENV)/installed-bench
+	$(BIN)/python -m benchmarks.truth --all --write docs/explanation/trust.md $(ARGS)
 
 docs: $(VENV)/installed-test
 	$(BIN)/python tests/test_docs.py

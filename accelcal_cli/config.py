@@ -1,5 +1,7 @@
 """YAML text to mappings and back, and the files that are shipped: the only place that reads or writes YAML.
 
+The parser is imported when there is YAML to read: most runs are without, and it takes as long as half of numpy.
+
 What a mapping means, a calibration or a sensor, is known where that is defined.
 """
 
@@ -8,12 +10,14 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
-
-import yaml
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from accelcal_cli.errors import ConfigError
+
+if TYPE_CHECKING:
+    import yaml
 
 CONFIGS = Path(__file__).parent / "configs"
 """The shipped configurations, inside the installed package."""
@@ -25,29 +29,35 @@ if not CONFIGS.is_dir():  # a checkout keeps them beside the package
     CONFIGS = Path(__file__).parent.parent / "configs"
 
 
-class _UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """A safe loader that refuses a key given twice, which YAML would silently keep the last of, and bombs.
+@cache
+def _loader() -> Any:
+    """Return a safe loader that refuses a key given twice, which YAML would silently keep the last of, and bombs.
 
     An alias stands for what it names, which may be an alias again: a page of them becomes gigabytes when it is written
     or compared. Aliases and depth are bounded before anything is built.
     """
+    import yaml
 
-    def get_single_node(self) -> yaml.Node | None:
-        node: yaml.Node | None = super().get_single_node()
-        if node is not None:
-            _weigh(node, {}, 0)
-        return node
+    class BoundedUniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+        def get_single_node(self) -> yaml.Node | None:
+            node: yaml.Node | None = super().get_single_node()
+            if node is not None:
+                _weigh(node, {}, 0)
+            return node
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str) or key in seen:
-                fault = f'key "{key}" is given twice' if isinstance(key, str) else f"key {key!r} is not text"
-                raise yaml.constructor.ConstructorError(None, None, fault, key_node.start_mark)
-            seen.add(key)
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        return mapping
+        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+            seen = set()
+            for key_node, _ in node.value:
+                key = self.construct_object(key_node, deep=True)
+                if not isinstance(key, str) or key in seen:
+                    twice = f'key "{key}" is given twice'
+                    fault = twice if isinstance(key, str) else f"key {key!r} is not text"
+                    raise yaml.constructor.ConstructorError(None, None, fault, key_node.start_mark)
+                seen.add(key)
+            mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+            return mapping
+
+    return BoundedUniqueKeys
 
 
 def _weigh(node: yaml.Node, known: dict[int, int], depth: int) -> int:
@@ -55,22 +65,21 @@ def _weigh(node: yaml.Node, known: dict[int, int], depth: int) -> int:
     if id(node) in known:
         return known[id(node)]
     if depth > DEEPEST:
-        raise yaml.constructor.ConstructorError(
-            None, None, f"nested more than {DEEPEST} deep", node.start_mark
-        )
+        raise _too_much(f"nested more than {DEEPEST} deep", node)
     known[id(node)] = MOST_VALUES  # an alias of itself
-    children: list[yaml.Node] = []
-    if isinstance(node, yaml.MappingNode):
-        children = [part for pair in node.value for part in pair]
-    elif isinstance(node, yaml.SequenceNode):
-        children = node.value
+    entries = node.value if isinstance(node.value, list) else []  # of a mapping these are pairs
+    children = [part for entry in entries for part in (entry if isinstance(entry, tuple) else (entry,))]
     weight = 1 + sum(_weigh(child, known, depth + 1) for child in children)
     if weight > MOST_VALUES:
-        raise yaml.constructor.ConstructorError(
-            None, None, f"its aliases stand for more than {MOST_VALUES:,} values", node.start_mark
-        )
+        raise _too_much(f"its aliases stand for more than {MOST_VALUES:,} values", node)
     known[id(node)] = weight
     return weight
+
+
+def _too_much(fault: str, node: yaml.Node) -> Exception:
+    from yaml.constructor import ConstructorError
+
+    return ConstructorError(None, None, fault, node.start_mark)
 
 
 def load_mapping(path: Path) -> dict[str, Any]:
@@ -107,8 +116,10 @@ def parse_mapping(text: str, where: str) -> dict[str, Any]:
         with contextlib.suppress(ValueError):  # YAML in flow style, or a fault that the YAML parser can place
             mapping: dict[str, Any] = json.loads(text, object_pairs_hook=_unique)
             return mapping
+    import yaml
+
     try:
-        content = yaml.load(text, Loader=_UniqueKeys)
+        content = yaml.load(text, Loader=_loader())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -130,6 +141,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def dump(record: Mapping[str, Any]) -> str:
     """Return a record as YAML text that reads back to the same record."""
+    import yaml
+
     text: str = yaml.dump(
         record,
         Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),

@@ -1,15 +1,21 @@
 """Planning: which poses to take next, the ones that shrink the worst dilution of precision most.
 
 A plan starts from what the poses so far determine; `distinct_poses` from nothing, for a capture.
+
+A cubic nonlinearity c_i of axis i reads f_i (1 + c_i f_i^2 / g^2) for f_i. To first order it changes a residual
+e = (g^2 - |f|^2) / 2g by -g c_i u_i^4, as a scale factor does by -g E_ii u_i^2. On the twelve edges u_i^2 is 0 or 1/2
+and on the faces 0 or 1: on either alone the two are one, and on both together each shows. So where there are enough
+poses, those that are as good for the nine to a few percent are chosen for the three c_i beside them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.arrays import Float, Int
+from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.observability import (
     PRIOR,
     Observability,
@@ -33,6 +39,17 @@ STARTED_POSES, FEWEST_STARTS = 300, 2
 """Random starts of an exchange: 300 poses over the number chosen, 2 at least."""
 
 
+FEWEST_WEIGHED = 14
+"""Poses, those so far included, from which on nonlinearity counts: the default, twelve edges, needs all of them."""
+
+COST = 1.1
+"""What the largest dilution of precision of each kind may rise to for it, as a part of that of the best poses."""
+
+NONLINEARITY, SEEN = 0.005, 3.0
+"""A cubic term as large as data sheets of MEMS accelerometers allow, part of g, and how many sigma make it visible.
+Where the noise hides it, the poses are those that are best for the nine alone."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """The next poses.
@@ -42,6 +59,8 @@ class Plan:
         directions: unit specific force of the next, best first, shape (k, 3).
         stages: what the poses determine before the first of them and after each, k + 1 entries.
         noise: standard deviation of one pose in parts of g; None when not known.
+        cubic: dilution of precision of the cubic term of each axis, beside the nine, after all poses, shape (3,); inf
+            where they cannot tell it from a scale factor.
         so_far: the calibration of the poses so far; None when there are none.
     """
 
@@ -49,6 +68,7 @@ class Plan:
     directions: Float
     stages: tuple[Observability, ...]
     noise: float | None
+    cubic: Float
     so_far: Calibration | None = None
 
     @property
@@ -72,7 +92,7 @@ def plan(
     noise: float | None,
     so_far: Calibration | None = None,
 ) -> Plan:
-    """Return the next `count` poses that shrink the worst sigma most.
+    """Return the next `count` poses: those that shrink the worst sigma most, with an eye to cubic nonlinearity.
 
     Args:
         information: J^T J of the poses so far, shape (9, 9); zeros when there are none.
@@ -84,11 +104,99 @@ def plan(
     """
     allowed = candidates(fixture)
     held = np.zeros(9, dtype=bool) if so_far is None else so_far.held
-    directions = allowed[best_poses(knowing(information, held), allowed, count)]
+    known, seen = knowing(information, held), _seen_of_twelve(so_far, held)
+    chosen = np.array(best_poses(known, allowed, count), dtype=np.intp)
+    if poses + count >= FEWEST_WEIGHED:
+        chosen = _weighed(known, seen, allowed, chosen, noise)
+    directions = allowed[chosen[next_poses_of(known, allowed[chosen])]]
     rows = design(directions)
     sums = [information + rows[:k].T @ rows[:k] for k in range(count + 1)]
     stages = tuple(Observability.of(total, poses + k, held) for k, total in enumerate(sums))
-    return Plan(poses, directions, stages, noise, so_far)
+    cubic = np.sqrt(_variances(seen, _rows_of_twelve(directions))[9:])
+    return Plan(poses, directions, stages, noise, np.where(cubic > UNSEEN, np.inf, cubic), so_far)
+
+
+UNSEEN = 0.5 / np.sqrt(PRIOR)
+"""A dilution of precision that is the prior's alone."""
+
+
+def _rows_of_twelve(u: Float) -> Float:
+    """Return the design rows of the nine parameters and of the three cubic terms, shape (J, 12), of unit directions."""
+    return np.concatenate([design(u), -(u**4)], axis=1)
+
+
+def _seen_of_twelve(so_far: Calibration | None, held: Bool) -> Float:
+    """Return what the poses whose directions are known say of the nine and the cubic terms, shape (12, 12)."""
+    seen = np.zeros((12, 12))
+    if so_far is not None:
+        rows = _rows_of_twelve(np.array([pose.direction for pose in so_far.poses_fit]).reshape(-1, 3))
+        seen += rows.T @ rows
+    seen[:9, :9] = knowing(seen[:9, :9], held)
+    return seen
+
+
+def _weighed(known: Float, seen: Float, allowed: Float, best: Int, noise: float | None) -> Int:
+    """Return poses that show the cubic terms and are as good as the best for the nine to COST; the best if none do.
+
+    Exchanges start from the best poses and from sets that begin with some faces.
+
+    Args:
+        known: information on the nine, shape (9, 9); seen: on the twelve, shape (12, 12).
+        allowed: directions to choose from, shape (C, 3); best: indices of the best poses for the nine.
+        noise: standard deviation of one pose in parts of g; None when not known.
+    """
+    rows = design(allowed)
+    limit = COST**2 * _largest(_variances(known, rows[best]))
+    kept, least = best, np.inf
+    for start in (best, *_begun_with_faces(known, rows, allowed, len(best))):
+        if (_largest(_variances(known, rows[start])) <= limit).all():
+            chosen, score = _exchange_within(known, seen, allowed, start, limit)
+            if score < least:
+                kept, least = chosen, score
+    variances = _variances(seen, _rows_of_twelve(allowed[kept]))[9:]
+    visible = SEEN * (noise or 0.0) * np.sqrt(variances) <= NONLINEARITY
+    return kept if visible.any() else best
+
+
+def _largest(variances: Float) -> Float:
+    """Return the largest variance of each kind, shape (..., 3), of those of the nine, shape (..., 9)."""
+    return np.asarray(variances.reshape(*variances.shape[:-1], 3, 3).max(axis=-1))
+
+
+def _begun_with_faces(known: Float, rows: Float, allowed: Float, count: int) -> Iterator[Int]:
+    """Yield sets of poses that begin with one to six faces and go on as is best for the nine."""
+    for faces in ([0], [0, 2], [0, 2, 4], [0, 1, 2, 3, 4, 5]):
+        if len(faces) >= count:
+            return
+        information = known + rows[faces].T @ rows[faces]
+        rest = np.array(next_poses(information, allowed, count - len(faces)), dtype=np.intp)
+        for power in POWERS:
+            rest = _exchange(information, rows, rest, power)
+        yield np.concatenate([np.array(faces, dtype=np.intp), rest])
+
+
+def _exchange_within(
+    known: Float, seen: Float, allowed: Float, start: Int, limit: Float
+) -> tuple[Int, float]:
+    """Return poses, exchanged while that lowers the sum of the cubic terms' variances within a limit, and the sum."""
+    nine, twelve = design(allowed), _rows_of_twelve(allowed)
+    chosen, score = start.copy(), float(_variances(seen, twelve[start])[9:].sum())
+    moved = True
+    while moved:
+        moved = False
+        for k in range(len(chosen)):
+            others = np.delete(chosen, k)
+            within = _variances_with(known + nine[others].T @ nine[others], nine)
+            after = _variances_with(seen + twelve[others].T @ twelve[others], twelve)[:, 9:].sum(axis=1)
+            scores = np.where((_largest(within) <= limit * (1.0 + ROUNDING)).all(axis=1), after, np.inf)
+            best = int(np.argmin(scores))
+            if scores[best] < score * (1.0 - LEAST_GAIN):
+                chosen[k], score, moved = best, float(scores[best]), True
+    return chosen, score
+
+
+LEAST_GAIN, ROUNDING = 1e-6, 1e-9
+"""Least part that an exchange takes off, and what a limit is missed by through rounding."""
 
 
 def candidates(fixture: str) -> Float:
@@ -166,13 +274,13 @@ def _exchange(information: Float, rows: Float, start: Int, power: float) -> Int:
 
 
 def _variances(information: Float, rows: Float) -> Float:
-    """Return the variances after the poses of some design rows, shape (9,)."""
-    return np.diagonal(np.linalg.inv(information + PRIOR * np.eye(9) + rows.T @ rows))
+    """Return the variances after the poses of some design rows, shape (p,) for p parameters."""
+    return np.diagonal(np.linalg.inv(information + PRIOR * np.eye(len(information)) + rows.T @ rows))
 
 
 def _variances_with(information: Float, rows: Float) -> Float:
-    """Return the variances after each of some poses alone, shape (C, 9): P - P a a^T P / (1 + a^T P a)."""
-    cofactor = np.linalg.inv(information + PRIOR * np.eye(9))
+    """Return the variances after each of some poses alone, shape (C, p): P - P a a^T P / (1 + a^T P a)."""
+    cofactor = np.linalg.inv(information + PRIOR * np.eye(len(information)))
     gain = rows @ cofactor
     drop: Float = gain**2 / (1.0 + np.einsum("cp,cp->c", gain, rows))[:, None]
     return np.diagonal(cofactor) - drop

@@ -13,13 +13,13 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Callable, Mapping
-from functools import cached_property
+import sys
+from collections.abc import Callable
+from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from accelcal_cli.errors import ConfigError, did_you_mean
-from accelcal_cli.schema import from_mapping
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -105,9 +105,9 @@ class Registry(Generic[T]):
             self.register(name)(self._load(self._entry_points[name]))
         return self._classes.get(name)
 
-    def build(self, name: str, mapping: Mapping[str, Any], where: str) -> T:
-        """Build the class called `name` from `mapping`; see `schema.from_mapping`."""
-        return from_mapping(self.get(name), mapping, where)
+    def is_built_in(self, cls: type) -> bool:
+        """Return whether a class is one of ours, and not of an installed package."""
+        return cls.__module__.startswith(f"{self.package}.")
 
     def beside(self, name: str, suffix: str) -> Path | None:
         """Return the file `<name><suffix>` in the folder of the class's module; None when there is none."""
@@ -118,6 +118,8 @@ class Registry(Generic[T]):
     @cached_property
     def _entry_points(self) -> dict[str, EntryPoint]:
         """The entry points of the group; where two packages share a name, the first on the path has it."""
+        if not is_mentioned(self.group):
+            return {}
         from importlib.metadata import entry_points
 
         return {point.name: point for point in reversed(tuple(entry_points(group=self.group)))}
@@ -136,3 +138,15 @@ class Registry(Generic[T]):
         if not (inspect.isclass(cls) and issubclass(cls, self.base)) or inspect.isabstract(cls):
             raise ConfigError(f"{place}: {point.value} is not a complete subclass of {self.base.__name__}")
         return cast(type[T], cls)
+
+
+@cache
+def is_mentioned(group: str) -> bool:
+    """Return whether an installed package may have entry points of a group: `importlib.metadata` is slow to import."""
+    for folder in map(Path, sys.path):
+        if folder.is_file():  # an archive: what is in it, `importlib.metadata` finds out
+            return True
+        files = folder.glob("*-info/entry_points.txt")
+        if any(f"[{group}]" in file.read_text("utf-8", errors="replace") for file in files):
+            return True
+    return False

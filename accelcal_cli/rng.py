@@ -43,6 +43,7 @@ class Purpose(IntEnum):
     SENSOR = 5  # error parameters
     START = 6  # starting population around the nominal sensor
     PLAN = 7  # sets of poses that an exchange starts from
+    CONSENSUS = 8  # subsets of poses that a robust fit starts from
     FIELD = 20  # gravity map
     INS = 21  # errors of an inertial navigation system
     GRAVIMETER = 22  # noise of measured gravity

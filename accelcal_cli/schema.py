@@ -17,15 +17,13 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-import numpy as np
-
 from accelcal_cli.errors import ConfigError, did_you_mean
 
 T = TypeVar("T")
 
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
-EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)e[-+]?\d+", re.IGNORECASE)
+EXPONENT = r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+"
 """A number that YAML 1.1 takes for text: 1e-6 has no dot, 1.5e6 no sign."""
 
 
@@ -110,7 +108,7 @@ def to_mapping(record: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):  # YAML does not know the numbers of numpy either
+    if hasattr(value, "tolist"):  # an array, or a number of numpy, which YAML does not know either
         return _plain(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -187,8 +185,6 @@ def _convert(value: Any, hint: Any, limits: Limits, label: str, extra: bool) -> 
             return None
         (hint,) = [argument for argument in arguments if argument is not type(None)]
         return _convert(value, hint, limits, label, extra)
-    if origin is np.ndarray:
-        return _array(value, limits, label)
     if origin is dict or dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
             raise ConfigError(f"{label}: expected a mapping of keys, not {_short(value)}")
@@ -199,10 +195,14 @@ def _convert(value: Any, hint: Any, limits: Limits, label: str, extra: bool) -> 
         return _sequence(value, arguments, limits, label, extra)
     if origin is typing.Literal:
         return _choice(value, arguments, label)
+    if origin is not None:  # the only other type with parameters
+        return _array(value, limits, label)
     return _free(value, label) if hint is Any else _scalar(value, hint, limits, label)
 
 
 def _array(value: Any, limits: Limits, label: str) -> Any:
+    import numpy as np  # here: most of what is declared has no arrays, and the help of a command does without
+
     rows: Any = float
     for length in reversed(limits.shape):
         rows = types.GenericAlias(tuple, (rows,) * length)
@@ -238,7 +238,9 @@ def _scalar(value: Any, hint: Any, limits: Limits, label: str) -> Any:
     if value is None and limits.none is not None:
         return limits.none
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if (hint is float and isinstance(value, str) and EXPONENT.fullmatch(value)) or (hint is float and number):
+    if (hint is float and isinstance(value, str) and re.fullmatch(EXPONENT, value)) or (
+        hint is float and number
+    ):
         value = _float(value, label)
     elif hint is int and number and (isinstance(value, int) or value.is_integer()):
         value = int(value)

@@ -12,8 +12,12 @@ from hypothesis import strategies as st
 from simulated import DPSO, rotation
 
 from accelcal_cli.calibration import observability as quality
+from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, next_poses
-from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
+from accelcal_cli.calibration.problem import Box, Loetters, pack
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.triangle import compress_each
+from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.planning import FIXTURES, PRIOR, best_poses, candidates, distinct_poses, plan
@@ -221,6 +225,66 @@ def test_fixtures_allow_more_and_more():
     whole = candidates("any")
     np.testing.assert_allclose(np.linalg.norm(whole, axis=1), 1.0, rtol=1e-14)
     assert len(np.unique(whole.round(9), axis=0)) == 290
+
+
+def _faces_of(u):
+    return int((np.abs(u).max(axis=1) > 1 - 1e-9).sum())
+
+
+def _largest_of_kinds(u):
+    return np.array([_dop(u)[kind].max() for kind in KINDS])
+
+
+@pytest.mark.parametrize("fixture", ["edges", "corners"])
+@pytest.mark.parametrize("count", [14, 16, 18, 24, 40])
+def test_enough_poses_contain_faces_and_cost_the_nine_little(count, fixture):
+    found = plan(np.zeros((9, 9)), 0, count, fixture, None)
+    assert _faces_of(found.directions) >= 1
+    best = candidates(fixture)[best_poses(np.zeros((9, 9)), candidates(fixture), count)]
+    assert (_largest_of_kinds(found.directions) <= 1.1 * _largest_of_kinds(best) * (1 + 1e-6)).all()
+    if count >= 16:
+        assert found.cubic.max() < 4.5
+
+
+def test_a_cubic_is_seen_as_its_dilution_says():
+    """A cubic of 0.5 % on z, fitted beside the nine in simulated readings of the planned poses."""
+    found = plan(np.zeros((9, 9)), 0, 18, "corners", 1e-4)
+    u, cubic, noise = found.directions, 0.005, 1e-4
+    rows = np.concatenate([design(u), -(u**4)], axis=1)
+    force = u * (1.0 + cubic * u**2 * np.array([0.0, 0.0, 1.0]))
+    estimates = []
+    for draw in Streams(7, range(400)).normal(len(u), 3):
+        e = (1.0 - np.sum((force + noise * draw) ** 2, axis=1)) / 2.0
+        estimates.append(np.linalg.lstsq(rows, e)[0][9:])
+    mean, scatter = np.mean(estimates, axis=0), np.std(estimates, axis=0)
+    np.testing.assert_allclose(mean, [0.0, 0.0, cubic], atol=2e-4)
+    np.testing.assert_allclose(scatter, noise * found.cubic, rtol=0.15)
+
+
+def test_twelve_edges_stay_the_default_and_are_blind_to_a_cubic():
+    found = plan(np.zeros((9, 9)), 0, 12, "corners", None)
+    assert _faces_of(found.directions) == 0
+    assert np.isinf(found.cubic).all()
+    assert "Cubic nonlinearity of any axis does not show" in pose_table(found).notes[-1]
+    assert record(found)["dop_cubic"] == [None] * 3
+
+
+def test_noise_that_hides_a_cubic_leaves_the_poses_to_the_nine():
+    quiet = plan(np.zeros((9, 9)), 0, 18, "edges", 1e-4)
+    noisy = plan(np.zeros((9, 9)), 0, 18, "edges", 0.01)
+    assert _faces_of(quiet.directions) > 0
+    best = candidates("edges")[best_poses(np.zeros((9, 9)), candidates("edges"), 18)]
+    assert _dop(noisy.directions).max() == pytest.approx(_dop(best).max(), rel=1e-9)
+    assert "shows in these poses" in pose_table(quiet).notes[-1]
+
+
+def test_faces_are_added_to_twelve_edges():
+    g = 9.8
+    readings = Readings.from_array(DPSO.output(g * poses.edges() + Streams(1, [0]).normal(12, 3)[0] * 1e-3))
+    result = calibrate(readings, Settings(g=g, optimizer="levenberg-marquardt"))
+    found = plan(result.information, 12, 6, "corners", 1e-4, result)
+    assert _faces_of(found.directions) >= 3
+    assert np.isfinite(found.cubic).all()
 
 
 def test_predicted_sigma_is_the_scatter_of_simulated_calibrations():

@@ -11,6 +11,7 @@ import pytest
 from accelcal_cli.errors import AccelcalError, ConfigError, did_you_mean
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.registry import Registry
+from accelcal_cli.schema import from_mapping
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_with_all():
@@ -30,10 +31,10 @@ def test_a_name_that_is_no_optimizer_is_refused(name):
 
 
 def test_a_registry_builds_by_name():
-    built = OPTIMIZERS.build("de", {"weight": 0.7}, "my.yaml")
+    built = from_mapping(OPTIMIZERS.get("de"), {"weight": 0.7}, "my.yaml")
     assert (built.name, built.weight) == ("de", 0.7)
     with pytest.raises(ConfigError, match=r'my.yaml: unknown key "wieght" \(did you mean "weight"\?\)'):
-        OPTIMIZERS.build("de", {"wieght": 0.7}, "my.yaml")
+        from_mapping(OPTIMIZERS.get("de"), {"wieght": 0.7}, "my.yaml")
 
 
 def test_one_name_loads_one_module(tmp_path, monkeypatch):

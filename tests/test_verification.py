@@ -175,7 +175,7 @@ def test_a_pose_that_is_wrong_is_named(u):
     assert found.verdict == "inconclusive"
     assert (
         str(found.warnings[-1])
-        == "Outlier: pose 4 does not fit the other poses (p < 0.01). Measure it again."
+        == "Outlier: pose 4 does not fit the other poses (p < 0.002). Measure it again."
     )
 
 
@@ -185,7 +185,7 @@ def test_a_pose_that_is_a_little_wrong_is_named_beside_the_verdict():
     found = verify(result(), Readings.from_array(output, labels=[f"p{k}" for k in range(24)]))
     assert found.verdict == "unchanged"
     assert [str(notice) for notice in found.warnings] == [
-        'Outlier: position "p3" does not fit the other poses (p < 0.01). Measure it again.',
+        'Outlier: position "p3" does not fit the other poses (p < 0.002). Measure it again.',
     ]
     assert verify(result(), new()).warnings == ()
 

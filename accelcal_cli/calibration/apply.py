@@ -16,6 +16,7 @@ from typing import IO
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.known_attitudes import covariance_of_twelve
 from accelcal_cli.calibration.observability import gauge_chain
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
@@ -193,7 +194,7 @@ class Tilt:
         """
         if result.gauge != "full":
             return cls(*_nine(result), noise)
-        if not np.isfinite(result.sigma.K_a).all():
+        if result.settings.get("attitudes") != "known":
             raise UsageError(
                 "--tilt: gauge full leaves the body frame open; calibrate in gauge lower or symmetric"
             )
@@ -229,17 +230,21 @@ def _nine(result: Calibration) -> tuple[Float, Float]:
     moves[:6, :, :3] = -result.model.K_A @ chain.T.reshape(6, 3, 3)
     for i in range(3):
         moves[6 + i, :, 3] = -result.model.K_A[:, i] * lower[i, i]
-    if not np.isfinite(result.covariance).all():
-        return moves, np.full((9, 9), np.nan)
-    values, vectors = np.linalg.eigh(result.covariance)
-    return moves, vectors * np.sqrt(np.maximum(values, 0.0))
+    return moves, _root(result.covariance)
 
 
 def _twelve(result: Calibration) -> tuple[Float, Float]:
-    """Return moves and root of K_a and D_a, entry by entry: known attitudes determine each of them."""
+    """Return moves and root of the twelve parameters of known attitudes: df = -K_A (dK_a f + dD_a) = -Y (f / g, 1)."""
     moves = np.zeros((12, 3, 4))
     for p in range(12):
         i, j = divmod(p, 4)
-        moves[p, :, j] = -result.model.K_A[:, i]
-    sigma = np.concatenate([result.sigma.K_a, result.sigma.D_a[:, None]], axis=1)
-    return moves, np.diag(sigma.ravel())
+        moves[p, i, j] = -1.0 / result.g if j < 3 else -1.0
+    return moves, _root(covariance_of_twelve(result))
+
+
+def _root(covariance: Float) -> Float:
+    """Return a root of a covariance: root root^T; NaN where it has no number."""
+    if not np.isfinite(covariance).all():
+        return np.full(covariance.shape, np.nan)
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -13,13 +13,23 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.calibration.consensus import consensus
 from accelcal_cli.calibration.distributions import chi_square_chance
-from accelcal_cli.calibration.fit import Fit
-from accelcal_cli.calibration.observability import FEWEST_POSES, SCALE, Geometry, poses_to_add
+from accelcal_cli.calibration.fit import NOTABLE_BIAS, Fit
+from accelcal_cli.calibration.observability import (
+    ALIGNED,
+    FEWEST_POSES,
+    SCALE,
+    PoseVerdict,
+    poses_to_add,
+)
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.search import rounding
+from accelcal_cli.calibration.weights import SURELY_TREMBLES
 from accelcal_cli.notices import Notice, Severity, are_serious
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
+from accelcal_cli.sensor.poses import AXES, axis_up
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -61,10 +71,25 @@ STOPPED_SHORT = 0.01
 EARTH = 9.76, 9.84
 """Gravity on Earth, m/s^2, from the top of the Andes to the Arctic Ocean."""
 
-NOISE_BIAS = 3.5
-"""Isotropic noise of standard deviation s, in units of g, makes scale factors too large by about 3.5 s^2: of c that
-minimises E (1 - c^2 |u + n|^2)^2, c^2 = E |u + n|^2 / E |u + n|^4 = (1 + 3 s^2) / (1 + 10 s^2 + 15 s^4), and the scale
-factor is 1 / c."""
+MATTERS = 0.3
+"""Sigmas of a parameter from which on a bias that may remain is a warning: a bias of 0.3 sigma lowers the coverage of
+an interval from 95 to 94 %."""
+
+LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
+"""Residuals of at most this part of the noise that the scatter predicts, and by chance this rarely, are told of."""
+
+CHECKABLE, FEW_TO_CHECK = 0.9, 3
+"""Leverage up to which a pose is checked by the others, and the degrees of freedom up to which that is asked: beyond
+them a pose that is wrong shows in 10 to 12 poses, too."""
+
+TURNED = 0.1
+"""A misalignment, rad, beyond which axes are more likely swapped, or a reading wrong, than a sensor made so."""
+
+FEWEST_FREEDOM = 4.0
+"""Degrees of freedom, by clusters of rows that follow each other, below which their interval is not to be relied on."""
+
+NEAR_NOMINAL, ALIKE = 0.005, 1.0 / 3.0
+"""Scale factors this far from a stated nominal sensor, all by the same within ALIKE of it, are rather a wrong g."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,21 +115,23 @@ class Assessment:
 def assess(fit: Fit) -> Assessment:
     """Assess a fit."""
     walled: list[bool] = np.asarray(fit.at_wall.any(axis=1)).tolist()
+    unchecked = _unchecked(fit)
     geometry = [
-        _geometry(verdict, wall, freedom)
-        for verdict, wall, freedom in zip(
-            fit.observability.verdicts, walled, fit.freedom.tolist(), strict=True
+        _geometry(verdict, wall, freedom, poor)
+        for verdict, wall, freedom, poor in zip(
+            fit.geometry.observability.verdicts,
+            walled,
+            fit.freedom.tolist(),
+            np.asarray(unchecked.any(axis=1)).tolist(),
+            strict=True,
         )
     ]
     reasons: list[tuple[str, ...]] = [()] * len(geometry)
     suggestions = list(reasons)
     for at, word in enumerate(geometry):
         if word != "good":
-            suggestions[at], reasons[at] = _advice(fit, at)
-    pose, outlier = fit.residuals.pose, fit.residuals.outlier
-    outliers: list[tuple[int, ...]] = [()] * len(geometry)
-    for at in np.flatnonzero(outlier.any(axis=1)).tolist():
-        outliers[at] = tuple(pose[at, outlier[at]].tolist())
+            suggestions[at], reasons[at] = _advice(fit, at, unchecked[at])
+    outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
     left = _to_gain(fit)
     for at in np.flatnonzero(_may_have_warnings(fit, left)).tolist():
@@ -113,27 +140,63 @@ def assess(fit: Fit) -> Assessment:
     return Assessment(fit, verdicts, reasons, suggestions, warnings, outliers)
 
 
-def _geometry(poses: Geometry, walled: bool, freedom: int) -> Geometry:
+def _unchecked(fit: Fit) -> Bool:
+    """Return which of the kept poses no other checks where that matters, shape (R, k): few, without scatter."""
+    asked = (fit.freedom >= 1) & (fit.freedom <= FEW_TO_CHECK) & np.isnan(fit.spread.ratio)
+    asked &= fit.solution is not None
+    return np.asarray((fit.residuals.leverage >= CHECKABLE) & fit.residuals.real & asked[:, None])
+
+
+def _geometry(poses: PoseVerdict, walled: bool, freedom: int, unchecked: bool) -> PoseVerdict:
     """Return the word on the poses, lowered where the search or their count does not bear it out."""
     if walled:
         return "undetermined"
-    return "weak" if freedom == 0 and poses == "good" else poses
+    return "weak" if (freedom == 0 or unchecked) and poses == "good" else poses
 
 
-def _verdict(geometry: Geometry, warnings: Sequence[Notice]) -> Verdict:
+def _verdict(geometry: PoseVerdict, warnings: Sequence[Notice]) -> Verdict:
     """Return the verdict on the calibration: `suspect` iff a warning stands and the poses determine it."""
     return "suspect" if geometry != "undetermined" and are_serious(warnings) else geometry
 
 
-def _advice(fit: Fit, at: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _outliers(fit: Fit) -> list[tuple[int, ...]]:
+    """Return the poses of each sensor that do not fit.
+
+    Gross errors hide each other, and bend a fit until sound poses look wrong: where the residuals are too large for a
+    sensor, those are named that disagree with most others.
+    """
+    pose, outlier = fit.residuals.pose, fit.residuals.outlier
+    outliers: list[tuple[int, ...]] = [()] * len(pose)
+    for at in np.flatnonzero(outlier.any(axis=1)).tolist():
+        outliers[at] = tuple(pose[at, outlier[at]].tolist())
+    if fit.solution is None or fit.settings.robust != "none":
+        return outliers
+    bent = (fit.s > LARGE * fit.settings.g) | (outlier.sum(axis=1) > 1) | fit.at_wall.any(axis=1)
+    bent &= np.array([word != "undetermined" for word in fit.geometry.observability.verdicts])
+    for at in np.flatnonzero(bent).tolist():
+        agreement = consensus(fit.sample.take(np.array([at])), fit.settings)
+        if agreement is not None and not agreement.agreeing.all():
+            outliers[at] = tuple(np.flatnonzero(~agreement.agreeing).tolist())
+    return outliers
+
+
+def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the poses that would bring a sensor to a good verdict, in words, and why it is not, in sentences."""
-    known = fit.solution is None
+    known, aligned = fit.solution is None, not fit.settings.misalignment
     freedom, poses = int(fit.freedom[at]), int(fit.sample.poses[at])
-    view, fewest = fit.view[at], FEWEST_KNOWN if known else FEWEST_POSES
+    attitudes = int(fit.geometry.attitudes[at])
+    view, fewest = fit.geometry.observability[at], FEWEST_KNOWN if known else FEWEST_POSES
     suggestions: tuple[str, ...] = ()
     if not known and view.verdict != "good":
-        suggestions = poses_to_add(fit.information[at], poses, aligned=not fit.settings.misalignment)
+        suggestions = poses_to_add(fit.geometry.information[at], attitudes, aligned=aligned)
     lines = list(view.in_words("The known attitudes" if known else "The poses", suggestions))
+    if not known and attitudes < poses and view.verdict != "good":
+        lines.insert(0, f"The {poses:,} poses have {attitudes} different attitudes, and those decide.")
+    if unchecked.any():
+        which = [fit.sample.readings(at).where(pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
+        lines.append(
+            f"No other pose checks {_listed(which)}: an error there would not show. Take at least {FEWEST_POSES + 1}."
+        )
     number = {4: "four", 6: "six", 9: "nine"}.get(poses - freedom, str(poses - freedom))
     if freedom < 0:
         lines.insert(0, f"{poses} poses are fewer than the {number} parameters; take at least {fewest}.")
@@ -156,7 +219,7 @@ def edge_names(at_wall: Bool) -> tuple[str, ...]:
 
 def _to_gain(fit: Fit) -> Float:
     """Return the part of the cost that a Gauss-Newton step would take off, shape (R,); 0 after a polish."""
-    gain = np.zeros(len(fit.sample))
+    gain = np.zeros(len(fit.K))
     solution = fit.solution
     if solution is None or fit.settings.polish:
         return gain
@@ -168,20 +231,41 @@ def _to_gain(fit: Fit) -> Float:
     return gain
 
 
-def _scale_sigma(fit: Fit) -> Float:
-    """Return the largest one-sigma of a scale factor, as a part of it, shape (R,)."""
-    return np.asarray(np.sqrt(np.einsum("rpp->rp", fit.covariance)[:, SCALE]).max(axis=1) / fit.settings.g)
+def _sigma(fit: Fit) -> Float:
+    """Return the one-sigma of the nine parameters, m/s^2, shape (R, 9), NaN where there is none."""
+    return np.asarray(np.sqrt(np.einsum("rpp->rp", fit.covariance)))
+
+
+def _may_be_biased(fit: Fit) -> Bool:
+    """Return which sensors may keep so much of the noise bias that it matters, shape (R,)."""
+    return np.asarray((fit.bias > MATTERS * _sigma(fit)).any(axis=1))
+
+
+def _angles(fit: Fit) -> Float:
+    """Return the largest angle by which two axes of each sensor miss 90 degrees, rad, shape (R,)."""
+    rows = fit.lower / np.linalg.norm(fit.lower, axis=2, keepdims=True)
+    return np.asarray(np.abs(np.arcsin((rows @ rows.swapaxes(1, 2))[:, [1, 2, 2], [0, 0, 1]])).max(axis=1))
 
 
 def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_warnings` has something to say of, or might have, shape (R,)."""
-    g, s, settings = fit.settings.g, fit.s, fit.settings
-    noisy = (s > LARGE * g) | (NOISE_BIAS * (s / g) ** 2 > _scale_sigma(fit))
-    noisy |= fit.noise[0] >= MORE_THAN_NOISE
+    g, s, settings, spread = fit.settings.g, fit.s, fit.settings, fit.spread
+    noisy = (s > LARGE * g) | (fit.bias > 0).any(axis=1) | (_angles(fit) > TURNED) | (fit.clusters > 0)
+    noisy |= (spread.ratio >= MORE_THAN_NOISE) | (spread.ratio <= LESS_THAN_NOISE)
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
-    searched |= fit.at_wall.any(axis=1)
+    searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
+    always |= settings.nominal is not None or _trembling(fit)
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
+
+
+def _trembling(fit: Fit) -> bool:
+    return fit.solution is not None and fit.solution.stated.tremor is not None
+
+
+def _fewest_attitudes(fit: Fit) -> int:
+    """Return how many attitudes the parameters need at least."""
+    return 4 if fit.solution is None else 9 if fit.settings.misalignment else int((~ALIGNED).sum())
 
 
 def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[Notice, ...]:
@@ -192,20 +276,136 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
     loss: Loss = "known" if fit.solution is None else "plain" if settings.robust == "none" else "robust"
     lines = [
         *readings.warnings,
+        *_few_attitudes(fit, at),
         *not_fitting(where, freedom, loss),
         *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
+        *_large_misalignment(float(_angles(fit)[at])),
     ]
     if fit.solution is None:
         return (*lines, *_turned_round(fit.K[at]))
-    walled = bool(fit.at_wall[at].any()) and fit.view[at].verdict != "undetermined"
+    walled = bool(fit.at_wall[at].any()) and fit.geometry.observability[at].verdict != "undetermined"
+    spread = fit.spread
     return (
-        *lines,
         *((WALLED,) if walled else ()),
-        *more_than_noise(*fit.noise[:, at].tolist()),
-        *_noise_bias(s, settings.g, float(_scale_sigma(fit)[at])),
+        *lines,
+        *_against_labels(fit, at),
+        *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at])),
+        *_less_than_noise(fit, at),
+        *_noise_bias(fit, at),
+        *_tremor(fit, at),
+        *_correlated(fit, at),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),
         *odd_gravity(settings.g),
+        *_off_nominal(fit, at),
+    )
+
+
+def _few_attitudes(fit: Fit, at: int) -> tuple[Notice, ...]:
+    attitudes, fewest = int(fit.geometry.attitudes[at]), _fewest_attitudes(fit)
+    if attitudes >= fewest or fit.solution is None:
+        return ()
+    text = f"The readings have {attitudes} different attitudes, fewer than the {fewest} parameters."
+    faces = fit.settings.misalignment and attitudes >= int((~ALIGNED).sum())
+    remedy = f"Take {FEWEST_POSES} poses or more" + (
+        ", or add --no-misalignment for scale and bias alone" if faces else ""
+    )
+    return (Notice("few-attitudes", "warning", text, remedy + "."),)
+
+
+def _large_misalignment(angle: float) -> tuple[Notice, ...]:
+    if not angle > TURNED:
+        return ()
+    text = (
+        f"Two axes miss 90 degrees by {angle * 1e3:,.0f} mrad: axes are swapped in some poses, a reading is wrong, or "
+        "the poses turn about too few axes."
+    )
+    return (Notice("large-misalignment", "warning", text, "Look at the worst poses, or add --robust huber."),)
+
+
+def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a warning of residuals far below the noise that the scatter within the poses predicts."""
+    ratio, chance = float(fit.spread.ratio[at]), float(fit.spread.p_less[at])
+    if not (ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at):
+        return ()
+    text = (
+        f"The residuals are {ratio:.2g} times what the scatter within the poses predicts: readings of two sensors are "
+        "mixed in each pose, or readings are copies."
+    )
+    remedy = "Choose one sensor with --where COLUMN=VALUE, and leave copies out."
+    return (Notice("several-sensors", "warning", text, remedy),)
+
+
+def _noise_bias(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return what was done about the noise bias, and a warning where too much of it may remain."""
+    if not (fit.bias[at] > 0).any():
+        return ()
+    noise = fit.s[at] / fit.settings.g
+    sizes = fit.bias[at] / np.where(_sigma(fit)[at] > 0, _sigma(fit)[at], np.inf)
+    if _may_be_biased(fit)[at]:
+        text = (
+            f"Noise of {noise:.2%} of g in each reading biases the parameters; that is taken off, but "
+            f"{np.nanmax(sizes):.1f} sigma may remain."
+        )
+        remedy = "Average the readings of each pose first (a column that labels the pose)."
+        return (Notice("noise-bias", "warning", text, remedy),)
+    text = f"Noise biases the parameters by more than {NOTABLE_BIAS:g} sigma; that is taken off."
+    return (Notice("noise-bias", "note", text),)
+
+
+def _shakes(fit: Fit, at: int) -> bool:
+    """Whether the readings of a sensor tremble in their poses."""
+    tremor = None if fit.solution is None else fit.solution.stated.tremor
+    return tremor is not None and bool(tremor.certainty[at] > SURELY_TREMBLES)
+
+
+def _tremor(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return what was done about a trembling hand, and a warning where too much of it may remain."""
+    tremor = None if fit.solution is None else fit.solution.stated.tremor
+    if tremor is None or not _shakes(fit, at):
+        return ()
+    angle, g = float(tremor.angle[at]), fit.settings.g
+    counted = tremor.excess[at, : int(fit.sample.poses[at])]
+    short = float(np.mean(counted)) / g**2
+    left = float(tremor.doubt[at]) / float(np.nanmin(_sigma(fit)[at, SCALE]))
+    text = (
+        f"The sensor trembled by {angle * 1e3:.2g} mrad within the poses, which shortens their mean by "
+        f"{short * 1e6:,.0f} ppm; that is given back"
+    )
+    if not left > MATTERS:
+        return (Notice("tremor", "note", text + "."),)
+    remedy = "Put the sensor down in each pose, or hold it against something."
+    return (Notice("tremor", "warning", f"{text}, but {left:.1f} sigma may remain.", remedy),)
+
+
+def _correlated(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return what was done about rows that follow each other, and a warning where they are too few for an interval."""
+    clusters, own = int(fit.clusters[at]), float(fit.spread.freedom[at])
+    if not clusters:
+        return ()
+    text = (
+        f"The rows follow each other and are not independent: sigma is by {clusters:,} groups of them, with {own:.1f} "
+        "degrees of freedom"
+    )
+    if own >= FEWEST_FREEDOM:
+        return (Notice("correlated", "note", text + "."),)
+    remedy = "Turn the sensor to more attitudes, or label the poses in a column."
+    return (Notice("correlated", "warning", text + ", too few to rely on.", remedy),)
+
+
+def _off_nominal(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a warning of scale factors that are all off a stated nominal sensor by the same."""
+    if fit.settings.nominal is None:
+        return ()
+    off = np.linalg.norm(fit.lower[at], axis=1) / np.array(fit.settings.nominal.scale) - 1.0
+    if not (abs(off.mean()) > NEAR_NOMINAL and np.ptp(off) < ALIKE * abs(off.mean())):
+        return ()
+    text = (
+        f"All scale factors are {off.mean():+.2%} off the stated nominal sensor, as they would be if g were "
+        f"{fit.settings.g * (1.0 + off.mean()):.6g} rather than {fit.settings.g:.6g}."
+    )
+    return (
+        Notice("wrong-gravity", "warning", text, "State yours with --g, or with --latitude and --height."),
     )
 
 
@@ -248,9 +448,7 @@ def not_fitting(outliers: Sequence[str], freedom: int, loss: Loss = "known") -> 
     """
     if not outliers:
         return ()
-    named = ", ".join(outliers[:MOST_NAMED])
-    if len(outliers) > MOST_NAMED:
-        named += f" and {len(outliers) - MOST_NAMED:,} more"
+    named = _listed(outliers)
     one = len(outliers) == 1
     subject = f"Outlier: {named} does" if one else f"Outliers: {named} do"
     them = "it" if one else "them"
@@ -259,12 +457,21 @@ def not_fitting(outliers: Sequence[str], freedom: int, loss: Loss = "known") -> 
     blame = freedom <= FEW and not one
     doubt = " With so few poses one can take the blame of another." if blame else ""
     rejected = f" The robust loss counts {them} little." if loss == "robust" else ""
-    text = f"{subject} not fit the other poses (p < 0.01).{doubt}{rejected}"
+    text = f"{subject} not fit the other poses (p < {OUTLIER_LEVEL}).{doubt}{rejected}"
     return (Notice("outliers", severity, text, remedy),)
 
 
+def _listed(poses: Sequence[str]) -> str:
+    """Return the names of poses, MOST_NAMED of them at most."""
+    more = f" and {len(poses) - MOST_NAMED:,} more" if len(poses) > MOST_NAMED else ""
+    return ", ".join(poses[:MOST_NAMED]) + more
+
+
 def more_than_noise(ratio: float, chance: float) -> tuple[Notice, ...]:
-    """Return a warning of residuals of so many times the noise that the scatter predicts, and its p-value."""
+    """Return a note of residuals of so many times the noise that the scatter predicts, and its p-value.
+
+    Sigma counts them: what moves the poses at random is in the intervals.
+    """
     if not (ratio >= MORE_THAN_NOISE and chance <= SURELY):
         return ()
     text = (
@@ -272,21 +479,12 @@ def more_than_noise(ratio: float, chance: float) -> tuple[Notice, ...]:
         "moved in them, changed its temperature or is not linear. Sigma counts that as noise."
     )
     remedy = "Let the sensor warm up, fix it in each pose, or add a column of temperatures."
-    return (Notice("residuals", "warning", text, remedy),)
+    return (Notice("residuals", "note", text, remedy),)
 
 
 def ratio_in_words(ratio: float) -> str:
     """Return a ratio with two digits, or more where it is large."""
     return f"{ratio:.2g}" if ratio < 100 else f"{ratio:,.0f}"
-
-
-def _noise_bias(s: float, g: float, sigma_scale: float) -> tuple[Notice, ...]:
-    bias = NOISE_BIAS * (s / g) ** 2
-    if not bias > sigma_scale:
-        return ()
-    text = f"The noise of one reading, {s:.3g}, makes the scale factors about {bias:.1%} too large, above their sigma."
-    remedy = "Average the readings of each pose first (a column that labels the pose)."
-    return (Notice("noise-bias", "warning", text, remedy),)
 
 
 def _unfinished(agreeing: int, runs: int, left: float) -> tuple[Notice, ...]:
@@ -325,3 +523,42 @@ def _turned_round(K: Float) -> tuple[Notice, ...]:
         "at rest points up."
     )
     return (Notice("negative-axes", "note", text, "Turn the sign of the reference (columns fx, fy, fz)."),)
+
+
+SAID = 0.5
+"""Least part of the force along an axis at which a label that calls this axis up or down can be contradicted."""
+
+
+def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a note of axes that the fit has the other way round than most labels that say which way is up."""
+    if fit.view[at].verdict == "undetermined":
+        return ()
+    readings, residuals = fit.sample.readings(at), fit.residuals
+    real = residuals.real[at]
+    votes = np.zeros(
+        (3, 2), dtype=int
+    )  # of each axis: labels that the fit bears out, and that it contradicts
+    for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
+        said = axis_up(readings.where(pose))
+        if said is not None:
+            axis, up = said
+            part = up * float(force[axis]) / fit.settings.g
+            votes[axis] += (part > SAID, part < -SAID)
+    turned = votes[:, 1] > votes[:, 0]
+    if not turned.any():
+        return ()
+    names = " and ".join(axis for axis, other in zip(AXES, turned, strict=True) if other)
+    if (turned | (votes.sum(axis=1) == 0)).all():
+        text = (
+            f"By the labels of the poses every axis that they name ({names}) points the other way than in the fit, "
+            "which cannot tell f from -f: the sensor may count gravity instead of specific force, and f comes out "
+            "with the other sign."
+        )
+        remedy = "If the labels are right, turn the sign of all three columns."
+    else:
+        text = (
+            f"By the labels of the poses axis {names} points the other way than in the fit, which cannot tell a sensor "
+            "from its mirror image."
+        )
+        remedy = f"If the labels are right, turn the sign of column {names}."
+    return (Notice("negative-axes", "note", text, remedy),)

@@ -11,10 +11,11 @@ from dataclasses import asdict
 import numpy as np
 
 from accelcal_cli import __version__
+from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
-from accelcal_cli.calibration.sample import NEEDS, Sample
+from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import DataError
@@ -54,7 +55,7 @@ def calibrate_many(readings: Sequence[Readings], settings: Settings) -> list[Cal
     results: list[Calibration | None] = [None] * len(readings)
     for group in _groups(readings, settings):
         sample = Sample.of([readings[at] for at in group])
-        for at, fault in zip(group, faults(sample, settings), strict=True):
+        for at, fault in zip(group, sample.faults(settings.weights), strict=True):
             if fault:
                 raise DataError(f"{readings[at].source}: {fault}")
         assessment = assessed(sample, settings)
@@ -94,24 +95,12 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
     return assess(result)
 
 
-def faults(sample: Sample, settings: Settings) -> list[str]:
-    """Return why each sensor cannot be calibrated, in a sentence, or nothing."""
-    words = [""] * len(sample)
-    for at in np.flatnonzero(sample.without_weights(settings.weights)).tolist():
-        words[at] = f"--weights {settings.weights} needs {NEEDS[settings.weights]}"
-    for at in np.flatnonzero(~(sample.upper > sample.lower).any(axis=1)).tolist():
-        poses = int(sample.poses[at])
-        words[at] = (
-            f"nothing to calibrate: {'only one pose' if poses == 1 else f'all {poses} poses are equal'}"
-        )
-    return words
-
-
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
     fit = assessment.fit
     settings, search, model = fit.settings, fit.search, ErrorModel(fit.K[at], fit.D[at])
-    ratio, chance = (None if np.isnan(v) else v for v in fit.noise[:, at].tolist())
+    noise = (float(fit.spread.ratio[at]), float(fit.spread.p_more[at]))
+    ratio, chance = (None if np.isnan(v) else v for v in noise)
     return Calibration(
         K_a=model.K,
         D_a=model.D,
@@ -120,7 +109,8 @@ def record(assessment: Assessment, at: int) -> Calibration:
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
         interval=NO_INTERVAL,
-        dop=Dop.of(fit.dop[at]),
+        dop=Dop.of(fit.view.dop[at]),
+        geometry=Dop.of(_nine_of(fit.geometry.observability.dop[at], fit.view.dop[at])),
         verdict=assessment.verdicts[at],
         reasons=assessment.reasons[at],
         suggestions=assessment.suggestions[at],
@@ -139,7 +129,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         nominal_scale=np.array(fit.nominal[at]),
         nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
         poses=int(fit.sample.poses[at]),
-        attitudes=fit.attitudes[at],
+        attitudes=int(fit.geometry.attitudes[at]),
         evaluations=int(search.evaluations[at]),
         runs=search.runs,
         runs_agreeing=int(search.agreeing[at]),
@@ -159,6 +149,11 @@ def record(assessment: Assessment, at: int) -> Calibration:
 def _origin(readings: Readings) -> dict[str, object]:
     named = {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
     return {**named, **asdict(readings.form)}
+
+
+def _nine_of(geometry: Float, view: Float) -> Float:
+    """Return the dilution of precision of nine parameters by the geometry; with known attitudes it has four columns."""
+    return geometry if len(geometry) == len(view) else view
 
 
 def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:

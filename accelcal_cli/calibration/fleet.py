@@ -8,14 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.assess import Assessment
-from accelcal_cli.calibration.calibrate import assessed, faults, record
+from accelcal_cli.calibration.calibrate import assessed, record
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
-from accelcal_cli.calibration.observability import MISALIGNMENT, PARAMETERS, ROWS_COLUMNS
+from accelcal_cli.calibration.observability import (
+    PARAMETERS,
+    SCALE,
+    engineering_chain,
+    engineering_quantities,
+    propagated,
+)
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
 from accelcal_cli.calibration.search import NO_NOISE
@@ -32,6 +39,9 @@ NAMED = 3
 
 LEVEL = 0.01
 """Chance of naming a sensor where none stands out (Bonferroni over sensors and quantities)."""
+
+NOISE = "noise of a pose, s"
+"""Name of the quantity s beside those of the nine parameters."""
 
 FEWEST = 10
 """Sensors that make a fleet to stand out from."""
@@ -50,8 +60,11 @@ class Fleet:
     Attributes:
         number: the sensors' numbers among the readings, shape (R,); poses: J of each.
         K_a, D_a: in the gauge of the settings, shapes (R, 3, 3) and (R, 3); sigma_k, sigma_d: their one-sigma.
-        lower: K_a in gauge `lower`, shape (R, 3, 3).
         coverage: factor from a sigma to the half-width of its 95 % interval, shape (R,).
+        parameters: the nine as an engineer takes them, see `engineering_quantities`, shape (R, 9): sensitivities in
+            output units per m/s^2, misalignments in mrad, biases in micro-g.
+        gain: their errors, of sensitivities as a part of themselves and else in rad and m/s^2, over the noise of a pose
+            in m/s^2, shape (R, 9).
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
         verdict: good, weak, suspect, undetermined or failed, shape (R,); reason: what the poses leave open, or why it
@@ -67,8 +80,9 @@ class Fleet:
     D_a: Float
     sigma_k: Float
     sigma_d: Float
+    gain: Float
     coverage: Float
-    lower: Float
+    parameters: Float
     dop: Float
     cost: Float
     s: Float
@@ -79,7 +93,7 @@ class Fleet:
     warnings: np.ndarray
     outlying: np.ndarray
 
-    @property
+    @cached_property
     def determined(self) -> Bool:
         """Which sensors the poses determine, the suspect ones too, shape (R,)."""
         return np.asarray((self.verdict != "undetermined") & (self.verdict != FAILED))
@@ -133,18 +147,17 @@ def calibrate_fleet(
     check_settings(settings)
     parts = []
     for batch in readings.batches():
-        sample = Sample.of_batch(readings, batch)
-        words = faults(sample, settings)
+        sample, numbers = Sample.of_batch(readings, batch), batch.sensors
+        words = sample.faults(settings.weights)
         if any(words):
             bad = np.array([bool(word) for word in words])
-            parts.append(_failed(batch.sensors[bad], batch.count[bad], [word for word in words if word]))
-            batch = batch.take(np.flatnonzero(~bad))
-            sample = Sample.of_batch(readings, batch)
-        if len(batch.sensors):
+            parts.append(_failed(numbers[bad], sample.poses[bad], [word for word in words if word]))
+            sample, numbers = sample.take(np.flatnonzero(~bad)), numbers[~bad]
+        if len(numbers):
             assessment = assessed(sample, settings, closed=True)
-            parts.append(_part(assessment, batch.sensors))
+            parts.append(_part(assessment, numbers))
             if keep is not None:
-                for at, number in enumerate(batch.sensors.tolist()):
+                for at, number in enumerate(numbers.tolist()):
                     keep(number, record(assessment, at))
     order = np.argsort(np.concatenate([part.number for part in parts]))
     fleet = Fleet(
@@ -158,7 +171,7 @@ def calibrate_fleet(
 
 def _part(assessment: Assessment, number: Int) -> Fleet:
     """Return the part of a fleet that an assessment tells of."""
-    fit, sample = assessment.fit, assessment.fit.sample
+    fit, sample, settings = assessment.fit, assessment.fit.sample, assessment.fit.settings
 
     def texts(lines: list[tuple[str, ...]]) -> np.ndarray:
         return np.array([" ".join(own) for own in lines], dtype=object)
@@ -176,9 +189,10 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         D_a=fit.D,
         sigma_k=fit.sigma_K,
         sigma_d=fit.sigma_D,
+        gain=propagated(engineering_chain(fit.lower, fit.D, fit.settings.g), fit.view.cofactor),
         coverage=fit.coverage,
-        lower=fit.lower,
-        dop=fit.dop,
+        parameters=engineering_quantities(fit.lower, fit.D) * _units(settings.g),
+        dop=fit.view.dop,
         cost=fit.value,
         s=fit.s,
         rms=fit.rms,
@@ -212,8 +226,9 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
         D_a=nan(3),
         sigma_k=nan(3, 3),
         sigma_d=nan(3),
+        gain=nan(9),
         coverage=nan(),
-        lower=nan(3, 3),
+        parameters=nan(9),
         dop=nan(9),
         cost=nan(),
         s=nan(),
@@ -227,57 +242,31 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """One quantity of every sensor.
+class Standout:
+    """A sensor that stands out.
 
     Attributes:
-        name, unit, format: as it is shown; values: shape (R,).
-        gain: its error over the noise of a pose in m/s^2, shape (R,); None where the poses do not decide it.
+        at: its place in the fleet; name: of the quantity, of `PARAMETERS` or `NOISE`.
+        value, middle: its own and the fleet's, in the unit of `Fleet`; z: robust, None for s.
     """
 
-    name: str
-    unit: str
-    format: str
-    values: Float
-    gain: Float | None = None
-
-
-@dataclass(frozen=True)
-class Standout:
-    """A sensor that stands out: its place in the fleet, the quantity, value and median, and robust z; None for s."""
-
     at: int
-    quantity: Quantity
+    name: str
     value: float
     middle: float
     z: float | None
 
 
-def parameters(fleet: Fleet, g: float) -> list[Quantity]:
-    """Return the nine parameters as an engineer takes them, gauge `lower`: K_ii, K_ij / K_ii, D_i / K_ii."""
-    per_unit = f"units per {'g' if g == 1.0 else 'm/s^2'}"
-    K, dop = fleet.lower, fleet.dop / g
-    scale = np.einsum("rii->ri", K)
-    mrad, micro_g = units.MRAD, units.MICRO_G
-    return [
-        *(
-            Quantity(f"scale factor {a}", per_unit, ".7g", scale[:, i], scale[:, i] * dop[:, i])
-            for i, a in enumerate("xyz")
-        ),
-        *(
-            Quantity(name, "mrad", ".3f", K[:, i, j] / scale[:, i] * mrad, dop[:, p] * mrad)
-            for p, name, (i, j) in zip((3, 4, 5), PARAMETERS[MISALIGNMENT], ROWS_COLUMNS[3:6], strict=True)
-        ),
-        *(
-            Quantity(f"bias {a}", "micro-g", ",.1f", bias * micro_g, dop[:, 6 + i] * micro_g)
-            for i, (a, bias) in enumerate(zip("xyz", (fleet.D_a / scale / g).T, strict=True))
-        ),
-    ]
+def _units(g: float) -> Float:
+    """Return the sizes of the units of `Fleet.parameters`, shape (9,): 1, mrad and micro-g."""
+    return np.repeat([1.0, units.MRAD, units.MICRO_G / g], 3)
 
 
-def noise(fleet: Fleet, g: float) -> Quantity:
-    """Return the noise of a pose of each sensor."""
-    return Quantity("noise of a pose, s", "g" if g == 1.0 else "m/s^2", ".3g", fleet.s)
+def _gains(fleet: Fleet, g: float) -> Float:
+    """Return the errors of `Fleet.parameters` over the noise of a pose in m/s^2, shape (R, 9)."""
+    gains = fleet.gain * _units(g)
+    gains[:, SCALE] *= fleet.parameters[:, SCALE]
+    return gains
 
 
 def standouts(fleet: Fleet, g: float) -> list[Standout]:
@@ -290,26 +279,25 @@ def standouts(fleet: Fleet, g: float) -> list[Standout]:
     known = np.flatnonzero(fleet.determined)
     if len(known) < FEWEST:
         return []
-    quantities = parameters(fleet, g)
-    tests = len(known) * (len(quantities) + 1)
+    tests = len(known) * (len(PARAMETERS) + 1)
     found = []
-    pose = np.fmax(
-        fleet.s[known], np.sqrt(_shared_variance(fleet))
-    )  # few poses estimate it too small at times
-    for quantity in quantities:
-        values = quantity.values[known]
+    shared = _shared_variance(fleet)
+    pose = np.fmax(fleet.s[known], np.sqrt(shared))  # few poses estimate it too small at times
+    gains = _gains(fleet, g)[known]
+    for p, name in enumerate(PARAMETERS):
+        values = fleet.parameters[known, p]
         middle = float(np.median(values))
         spread = NORMAL_MAD * float(np.median(np.abs(values - middle)))
         if spread <= 1e-9 * float(np.abs(values).max()):
             continue  # all alike, but for rounding
-        own = 0.0 if quantity.gain is None else (pose * quantity.gain[known]) ** 2
+        own = (pose * gains[:, p]) ** 2
         z = (values - middle) / np.sqrt(spread**2 + np.maximum(own - np.median(own), 0.0))
         far = np.flatnonzero(np.abs(z) > 3.0)
         freedom = np.full(len(far), min(MOST_FREEDOM, int(EFFICIENCY * len(known))))
         far = far[student_chance(np.abs(z[far]), freedom) * tests < LEVEL]
-        found += [Standout(int(known[k]), quantity, float(values[k]), middle, float(z[k])) for k in far]
+        found += [Standout(int(known[k]), name, float(values[k]), middle, float(z[k])) for k in far]
     found.sort(key=lambda one: -abs(one.z or 0.0))
-    return found + _noisy(fleet, g, tests)
+    return found + _noisy(fleet, shared, g, tests)
 
 
 def _shared_variance(fleet: Fleet) -> float:
@@ -322,9 +310,8 @@ def _shared_variance(fleet: Fleet) -> float:
     return float(np.median(fleet.s[known] ** 2 / middle))
 
 
-def _noisy(fleet: Fleet, g: float, tests: int) -> list[Standout]:
-    """Return the sensors whose s is beyond chance above what the fleet shares, worst first."""
-    shared = _shared_variance(fleet)
+def _noisy(fleet: Fleet, shared: float, g: float, tests: int) -> list[Standout]:
+    """Return the sensors whose s is beyond chance above the variance that the fleet shares, worst first."""
     if shared <= (NO_NOISE * g) ** 2:
         return []
     known = np.flatnonzero(fleet.determined & (fleet.s > 0))
@@ -333,5 +320,5 @@ def _noisy(fleet: Fleet, g: float, tests: int) -> list[Standout]:
     far = np.flatnonzero(x > freedom + 3.0 * np.sqrt(2.0 * freedom))
     far = far[chi_square_chance(x[far], freedom[far]) * tests < LEVEL]
     far = known[far[np.argsort(-x[far])]]
-    quantity, middle = noise(fleet, g), float(np.sqrt(shared))
-    return [Standout(int(at), quantity, float(fleet.s[at]), middle, None) for at in far]
+    middle = float(np.sqrt(shared))
+    return [Standout(int(at), NOISE, float(fleet.s[at]), middle, None) for at in far]

@@ -3,28 +3,27 @@
     N_j = K_a f_j + D_a + K_a n_j            [dpso2014] eq. 10
 
 With the specific force f_j of every pose known, each row of [K_a D_a] follows from the rows [f_j 1] alone. In the body
-frame the errors of the estimate are X = (F^T F)^-1 F^T n, with covariance s^2 (F^T F)^-1 for each of the three axes.
+frame the errors of the estimate are X = (F^T F)^-1 F^T n. Each sensor axis has a noise of its own, s_i from its J - 4
+degrees of freedom, and its row of [K_a D_a] the covariance s_i^2 (F^T F)^-1.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.fit import (
-    KEPT,
-    KEPT_WORST,
-    OUTLIER_LEVEL,
-    Fit,
-    PoseResiduals,
-    coverage_of,
-    room_of,
-    uncalibrated,
-)
+from accelcal_cli.calibration.attitudes import Geometry, distinct
+from accelcal_cli.calibration.covariance import plain_spread
+from accelcal_cli.calibration.fit import Fit, coverage_of, uncalibrated
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability
+from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL, PoseResiduals, room_of
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.weights import alike_weights
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import to_gauge
@@ -52,11 +51,15 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     readings, g = sample.readings(0), settings.g
     N, f, w = _inputs(sample, settings, readings)
     K, D, cofactor, leverage = _solved(N, f, w, g, readings)
-    error = np.linalg.solve(K, (N - f @ K.T - D).T).T  # K_a^-1 (N - K_a f - D_a), m/s^2, shape (J, 3)
-    freedom = 3 * len(f) - 12
-    s = np.sqrt(np.sum(w[:, None] * error**2) / freedom) if freedom > 0 else np.float64(np.nan)
+    left = N - f @ K.T - D
+    error = np.linalg.solve(K, left.T).T  # K_a^-1 (N - K_a f - D_a), m/s^2, shape (J, 3)
+    free = len(f) - 4
+    freedom, room = 3 * free, free if free > 0 else np.nan
+    s = np.sqrt(np.sum(w[:, None] * error**2) / (3 * room))
+    axes = np.sqrt(np.sum(w[:, None] * left**2, axis=0) / room)  # s_i, output units
     low = to_gauge(K, "lower")
-    nine = _nine(K, low, cofactor)
+    back = np.linalg.solve(K, np.diag(axes))
+    covariance, nine = _nine(K, low, cofactor, back @ back.T)[None], _nine(K, low, cofactor, np.eye(3))
     dop = np.sqrt(np.diagonal(cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
     size = np.sqrt(np.diagonal(K @ K.T))  # the output of each axis for one unit of force along it
     nominal, bias, before = uncalibrated(np.array([size.mean()]), D[None], settings)
@@ -65,6 +68,11 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     length = np.linalg.norm(force, axis=1)
     modulus, value = length - np.linalg.norm(f, axis=1), np.array([np.sum((g * g - length**2) ** 2)])
     columns = Observability(cofactor[None], dop[None], dop[None], np.array([4]), NAMES)
+    u = f / np.linalg.norm(f, axis=1, keepdims=True)
+    attitudes, _ = distinct(u[None], np.ones((1, len(u)), dtype=bool), sample.labelled)
+    information = np.linalg.pinv(nine)[None]
+    view = Observability(nine[None], np.sqrt(np.diagonal(nine))[None], columns.bounded, np.array([9]))
+    spread = plain_spread(np.array([s**2]), nine[None], np.array([free]))
     return Fit(
         sample=sample,
         settings=settings,
@@ -73,25 +81,26 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         K=K[None],
         D=D[None],
         lower=low[None],
-        sigma_K=(s * np.outer(size, dop[:3]) / g)[None],
-        sigma_D=(s * size * dop[3])[None],
+        sigma_K=(np.outer(axes, dop[:3]) / g)[None],
+        sigma_D=(axes * dop[3])[None],
         value=value,
-        observability=columns,
-        view=columns,
-        dop=np.sqrt(np.diagonal(nine))[None],
-        information=np.linalg.pinv(nine)[None],
+        view=view,
+        information=information,
         sight=(low[None], D[None]),
+        geometry=Geometry(attitudes, columns, information),
         freedom=np.array([freedom]),
+        spread=replace(spread, covariance=covariance),
         s=np.array([s]),
-        covariance=s**2 * nine[None],
-        coverage=coverage_of(np.array([freedom])),
+        covariance=covariance,
+        coverage=coverage_of(spread.freedom),
+        bias=np.zeros((1, 9)),
+        clusters=np.zeros(1, dtype=np.intp),
         at_wall=np.zeros((1, 12), dtype=bool),
         rms=np.sqrt([np.mean(modulus**2)]),
         rms_before=np.sqrt([np.mean(raw**2)]),
         before=before,
         nominal=nominal,
         residuals=_residuals(error, w, leverage, s, freedom, modulus, raw, force),
-        noise=np.full((2, 1), np.nan),
         notes=_notes(sample),
     )
 
@@ -108,7 +117,7 @@ def _inputs(sample: Sample, settings: Settings, readings: Readings) -> tuple[Flo
             f"{readings.source}: the reference specific force has a mean length of {length:.6g}, and g is "
             f"{settings.g:.6g}; state the g of its unit with --g"
         )
-    weights = sample.weights(settings.weights)
+    weights = alike_weights(sample) if settings.weights == "sd" else sample.counts(settings.weights)
     w = np.ones(len(sample.reference[0])) if weights is None else weights[0]
     return sample.output()[0], sample.reference[0], w
 
@@ -151,12 +160,20 @@ def _check_axes(readings: Readings, N: Float, K: Float) -> None:
         )
 
 
-def _nine(K: Float, low: Float, cofactor: Float) -> Float:
-    """Return the cofactor of the nine parameters, shape (9, 9), for K, K in gauge `lower`, and (F^T W F)^-1.
+def _nine(K: Float, low: Float, cofactor: Float, noise: Float) -> Float:
+    """Return the covariance of the nine parameters, shape (9, 9), for K, K in gauge `lower`, and (F^T W F)^-1.
 
-    By d (nine parameters of gauge `lower`) / d Y, shape (9, 12): [dK_a dD_a] = K_a Y with Y in units of force (its
-    first three columns at 1 g), rows running slowest. So E = -Y / g in the body frame, R E R^T in that of gauge
-    `lower`, and of it the rotation is no change of the sensor.
+    `noise` is the covariance of one pose as force, shape (3, 3).
+    """
+    chain = _chain(K, low)
+    return np.asarray(chain @ np.kron(noise, cofactor) @ chain.T)
+
+
+def _chain(K: Float, low: Float) -> Float:
+    """Return d (nine parameters of gauge `lower`) / d Y, shape (9, 12), for K and K in gauge `lower`.
+
+    [dK_a dD_a] = K_a Y with Y in units of force (its first three columns at 1 g), rows running slowest. So E = -Y / g
+    in the body frame, R E R^T in that of gauge `lower`, and of it the rotation is no change of the sensor.
     """
     R = np.linalg.solve(low, K)
     columns = []
@@ -167,8 +184,30 @@ def _nine(K: Float, low: Float, cofactor: Float) -> Float:
         both = E + E.T
         column = [both[i, j] * (0.5 if i == j else 1.0) for i, j in ROWS_COLUMNS[:6]]
         columns.append([*column, *(K @ Y[:, 3] / np.diagonal(low))])
-    chain = np.array(columns).T
-    return np.asarray(chain @ np.kron(np.eye(3), cofactor) @ chain.T)
+    return np.array(columns).T
+
+
+def covariance_of_twelve(result: Calibration) -> Float:
+    """Return the covariance of Y, shape (12, 12), (m/s^2)^2, of a result with known attitudes: see `_chain`.
+
+    Definition: B x C, B the noise of the three axes in the body frame (one, where it is the same in all), C the
+    covariance (F^T W F)^-1 s^2 of a row of Y. A record has C as what its nine parameters' covariance is made of:
+    linear in C, and with more equations than C has entries. NaN where it has none.
+    """
+    K = result.K_a
+    if not np.isfinite(result.covariance).all():
+        return np.full((12, 12), np.nan)
+    noise = np.linalg.solve(K, np.diag(result.sigma.D_a))
+    B = noise @ noise.T
+    B *= 3.0 / np.trace(B)
+    chain = _chain(K, to_gauge(K, "lower"))
+    entries = [(i, j) for i in range(4) for j in range(i + 1)]
+    units = [np.zeros((4, 4)) for _ in entries]
+    for unit, (i, j) in zip(units, entries, strict=True):
+        unit[i, j] = unit[j, i] = 1.0
+    parts = np.stack([(chain @ np.kron(B, unit) @ chain.T).ravel() for unit in units], axis=1)
+    sizes = np.linalg.lstsq(parts, result.covariance.ravel())[0]
+    return np.asarray(np.kron(B, np.tensordot(sizes, units, axes=1)), dtype=float)
 
 
 def _residuals(

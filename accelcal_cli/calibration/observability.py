@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.model import AXIS_PAIRS, ErrorModel, bias_force, misalignment, sensitivity
 from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
 ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
@@ -48,7 +49,7 @@ it, 1e-6, is the smallest relative difference between poses that an ordinary CSV
 ALIGNED = np.repeat([False, True, False], 3)
 """The parameters that are not estimated when the axes are taken as perpendicular."""
 
-Geometry = Literal["good", "weak", "undetermined"]
+PoseVerdict = Literal["good", "weak", "undetermined"]
 """What the poses alone say of a calibration: how an error of one reading comes out in the parameters."""
 
 
@@ -58,7 +59,7 @@ def design(u: Float) -> Float:
     return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
 
 
-def verdict_of(worst: float, rank: int, parameters: int = 9) -> Geometry:
+def verdict_of(worst: float, rank: int, parameters: int = 9) -> PoseVerdict:
     """Return the verdict on poses that determine `rank` directions, with this largest dilution of precision."""
     if rank < parameters or worst > UNDETERMINED:
         return "undetermined"
@@ -149,12 +150,12 @@ class Observability:
         return np.asarray(self.dop.max(axis=-1))
 
     @property
-    def verdict(self) -> Geometry:
+    def verdict(self) -> PoseVerdict:
         """Definition: undetermined above 25 or below full rank, weak above 10, good otherwise. One set of poses."""
         return verdict_of(float(self.worst), int(self.rank), len(self.names))
 
-    @property
-    def verdicts(self) -> list[Geometry]:
+    @cached_property
+    def verdicts(self) -> list[PoseVerdict]:
         """The verdict on each of R sets of poses."""
         return [
             verdict_of(worst, rank, len(self.names))
@@ -180,6 +181,17 @@ class Observability:
         """Return the names of the parameters whose bounded dilution is above `limit`, worst first. One set of poses."""
         order = np.argsort(-np.round(self.bounded, 3), kind="stable")
         return [self.names[i] for i in order if self.bounded[i] > limit]
+
+
+def moved_sensor(K: Float, D: Float, step: Float, g: float) -> tuple[Float, Float]:
+    """Return K, gauge `lower`, and D of sensors whose nine parameters change by a step, m/s^2, shape (R, 9).
+
+    K_A becomes (I + E) K_A, with the lower triangle E (times g) and the biases as force from the step.
+    """
+    E = np.zeros_like(K)
+    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+        E[:, i, j] = step[:, p] / g
+    return K @ np.linalg.inv(np.eye(3) + E), D + np.einsum("rii->ri", K) * step[:, BIAS]
 
 
 def directions_of(output: Float, model: ErrorModel) -> Float:
@@ -283,20 +295,74 @@ def propagate(K: Float, K_lower: Float, covariance: Float, gauge: str, g: float)
             second order, and they come out as NaN.
         g: local gravity, m/s^2.
     """
-    variance = np.einsum("...pp->...p", covariance)
-    sigma_D = np.sqrt(variance[..., BIAS]) * np.einsum("...ii->...i", K_lower)
+    sigma_D = np.sqrt(np.einsum("...pp->...p", covariance)[..., BIAS]) * np.einsum("...ii->...i", K_lower)
     if gauge == "full":
         return np.full(K.shape, np.nan), sigma_D
     chain = gauge_chain(K, K_lower, gauge, g)
-    lost = np.isnan(variance[..., :6])
-    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance[..., :6, :6]), chain)
-    size = np.abs(chain)
-    felt = size > 1e-9 * size.max(axis=(-1, -2), keepdims=True)
-    touched = (felt & lost[..., None, :]).any(axis=-1)
-    sigma_K = np.where(touched, np.nan, np.sqrt(np.maximum(square, 0.0))).reshape(K.shape)
+    sigma_K = propagated(chain, covariance[..., :6, :6]).reshape(K.shape)
     exact = {"lower": np.triu(np.ones((3, 3)), 1), "upper": np.tril(np.ones((3, 3)), -1)}
     # A zero of the gauge has no error.
     return np.where(exact.get(gauge, np.zeros((3, 3))), 0.0, sigma_K), sigma_D
+
+
+def engineering_quantities(K: Float, D: Float) -> Float:
+    """Return what an engineer states, shape (..., 9): sensitivities, misalignments (rad) and biases as force.
+
+    In the order of PARAMETERS; none of them depends on the gauge.
+
+    Args:
+        K: K_a in any gauge, shape (..., 3, 3); D: bias, less its nominal value where there is one, shape (..., 3).
+    """
+    return np.concatenate([sensitivity(K), misalignment(K), bias_force(K, D)], axis=-1)
+
+
+def engineering_chain(lower: Float, D: Float, g: float) -> Float:
+    """Return d quantities / d parameters, shape (..., 9, 9); sensitivities as a part of themselves.
+
+    K_a changes by -K_a E / g. With k_i the rows of K_a, s_i their lengths and r_i = k_i / s_i:
+
+        d s_i / s_i = -r_i E r_i / g
+        d (r_i r_j) = -r_i (E + E^T) r_j / g - r_i r_j (d s_i / s_i + d s_j / s_j)
+        d (D_i / s_i) = d D_i / s_i - D_i / s_i (d s_i / s_i)
+
+    Args:
+        lower: K_a in gauge `lower`, shape (..., 3, 3); D: as of `engineering_quantities`, shape (..., 3).
+        g: local gravity, m/s^2: the first six parameters are g times the entries of E.
+    """
+    s = sensitivity(lower)
+    rows = lower / s[..., None]
+    change = np.zeros((*lower.shape[:-2], 9, 9))
+    for p, (a, b) in enumerate(ROWS_COLUMNS[:6]):
+        scale = -rows[..., a] * rows[..., b] / g
+        change[..., :3, p] = scale
+        for q, (i, j) in enumerate(AXIS_PAIRS):
+            cosine = np.sum(rows[..., i, :] * rows[..., j, :], axis=-1)
+            turn = -(rows[..., i, a] * rows[..., j, b] + rows[..., i, b] * rows[..., j, a]) / g
+            turn -= cosine * (scale[..., i] + scale[..., j])
+            change[..., 3 + q, p] = turn / np.sqrt(1.0 - cosine**2)
+        change[..., 6:, p] = -D / s * scale
+    for i in range(3):
+        change[..., 6 + i, 6 + i] = lower[..., i, i] / s[..., i]
+    return change
+
+
+def propagated(chain: Float, covariance: Float) -> Float:
+    """Return the standard deviations, shape (..., n), that a covariance, shape (..., p, p), gives n quantities.
+
+    Args:
+        chain: their derivatives, shape (..., n, p).
+        covariance: NaN in the row of a parameter without one, which leaves none to the quantities that it moves.
+    """
+    lost = np.isnan(np.einsum("...pp->...p", covariance))
+    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance), chain)
+    size = np.abs(chain)
+    moved = size > NEGLIGIBLE * size.max(axis=(-1, -2), keepdims=True)
+    touched = (moved & lost[..., None, :]).any(axis=-1)
+    return np.where(touched, np.nan, np.sqrt(np.maximum(square, 0.0)))
+
+
+NEGLIGIBLE = 1e-9
+"""A derivative below this part of the largest is rounding."""
 
 
 def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:

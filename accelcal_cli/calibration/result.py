@@ -25,6 +25,9 @@ from accelcal_cli.calibration.observability import (
     ROWS_COLUMNS,
     SCALE,
     UNDETERMINED,
+    engineering_chain,
+    engineering_quantities,
+    propagated,
 )
 from accelcal_cli.calibration.settings import LARGEST
 from accelcal_cli.config import parse_mapping, read_text
@@ -41,6 +44,9 @@ SCHEMA = "accelcal/calibration/2"
 
 OLDER = "accelcal/calibration/1"
 """The version before it, which is read, too: see `_of_older`."""
+
+ENGINEERING = ("value", "sigma", "interval")
+"""Keys of each kind in the engineering view of a record."""
 
 Verdict = Literal["good", "weak", "suspect", "undetermined"]
 """Of a calibration: that of its poses, lowered by a warning and by what the search and the count of poses say."""
@@ -173,7 +179,8 @@ class Calibration:
         gauge: lower, upper, symmetric or full.
         sigma: one-sigma of K_a and D_a; interval: half-widths of their 95 % intervals, `coverage_factor` times sigma
             (Student's t, None without degrees of freedom), NaN for those that are not determined.
-        dop: dilution of precision.
+        dop: dilution of precision of the poses as they count; geometry: of their distinct attitudes, each counted once
+            and all together as twelve, which the verdict on the poses rests on.
         verdict: good, weak, suspect or undetermined; `reasons` says in sentences what the poses leave open.
         suggestions: poses that would mend it.
         warnings: what speaks against the readings, the fit or the search; one of severity `warning` makes it suspect.
@@ -209,6 +216,7 @@ class Calibration:
     sigma: Sigma
     interval: Sigma
     dop: Dop
+    geometry: Dop
     verdict: Verdict
     reasons: tuple[str, ...]
     suggestions: tuple[str, ...]
@@ -269,7 +277,7 @@ class Calibration:
         """
         if self.verdict != "undetermined":
             return np.zeros(9, dtype=bool)
-        poor: Bool = np.array([self.dop.parameters[name] for name in PARAMETERS]) > UNDETERMINED
+        poor: Bool = np.array([self.geometry.parameters[name] for name in PARAMETERS]) > UNDETERMINED
         return poor | np.isnan(np.diagonal(self.covariance))
 
     @property
@@ -284,10 +292,23 @@ class Calibration:
         return lost
 
     @property
-    def interval_nine(self) -> Float:
-        """Half-widths of the 95 % intervals of the nine parameters, gauge `lower`, m/s^2, shape (9,), NaN for none."""
+    def engineering(self) -> tuple[Float, Float]:
+        """The engineering view: values and their one-sigma, shape (9,), in the order of PARAMETERS.
+
+        Definition: sensitivities over nominal less 1; angles by which axes miss 90 degrees, rad; bias less nominal as
+        force along its axis, m/s^2. None depends on the gauge. Sigma: of the whole covariance, NaN where there is none.
+        """
+        offset = self.D_a - self.nominal_bias
+        values = engineering_quantities(self.K_a, offset)
+        sigma = propagated(engineering_chain(self.model.in_gauge("lower").K, offset, self.g), self.covariance)
+        size = values[SCALE] / self.nominal_scale
+        values[SCALE], sigma[SCALE] = size - 1.0, size * sigma[SCALE]
+        return values, sigma
+
+    def interval_of(self, sigma: Float) -> Float:
+        """Return the half-widths of the 95 % intervals of the nine, shape (9,), of their one-sigma; NaN for none."""
         factor = math.nan if self.coverage_factor is None else self.coverage_factor
-        return np.where(self.lost, np.nan, factor * np.sqrt(np.diagonal(self.covariance)))
+        return np.where(self.lost, np.nan, factor * sigma)
 
     def with_intervals(self, factor: float) -> Calibration:
         """Return the same result with the 95 % intervals of a coverage factor, NaN for none."""
@@ -317,8 +338,17 @@ class Calibration:
             )
 
     def record(self) -> dict[str, Any]:
-        """Return the record as plain mappings, lists, numbers and text; NaN and inf become None."""
-        return to_mapping(self)
+        """Return the record as plain mappings, lists, numbers and text; NaN and inf become None.
+
+        Beside the fields the engineering view, which follows from them and is not read again.
+        """
+        values, sigma = self.engineering
+        columns = (np.where(self.lost | self.held, np.nan, values), sigma, self.interval_of(sigma))
+        view = {
+            key: {kind: column[part] for kind, column in zip(ENGINEERING, columns, strict=True)}
+            for key, part in (("scale_error", SCALE), ("misalignment", MISALIGNMENT), ("bias", BIAS))
+        }
+        return {**to_mapping(self), "engineering": to_mapping(view)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any], where: str) -> Calibration:
@@ -337,8 +367,9 @@ class Calibration:
             result = from_mapping(cls, record, place, extra=True)
         except ConfigError as error:
             raise DataError(str(error)) from None
-        if set(result.dop.parameters) != set(PARAMETERS):
-            raise DataError(f"{place}: dop: parameters: expected {', '.join(PARAMETERS)}")
+        for key, dop in (("dop", result.dop), ("geometry", result.geometry)):
+            if set(dop.parameters) != set(PARAMETERS):
+                raise DataError(f"{place}: {key}: parameters: expected {', '.join(PARAMETERS)}")
         if np.abs(result.K_a).max() < 1 / LARGEST or np.linalg.matrix_rank(result.K_a) < 3:
             raise DataError(f"{place}: K_a: is singular; expected an invertible matrix")
         if not older:
@@ -368,6 +399,7 @@ def _of_older(record: Mapping[str, Any]) -> dict[str, Any]:
         "coverage_factor": None,
         "attitudes": None,
     }
+    new["geometry"] = new.get("dop")
     new["interval"] = {"K_a": [[None] * 3] * 3, "D_a": [None] * 3}
     for old, key in (("noise_ratio", "residual_noise_ratio"), ("noise_chance", "residual_noise_p")):
         if old in new:

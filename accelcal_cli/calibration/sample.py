@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,9 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
-from accelcal_cli.io.readings import LOOKED_AT, RAW_ROWS, Readings, may_be_doubtful
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.screening import LOOKED_AT
+from accelcal_cli.sensor.poses import axis_up
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -37,6 +39,15 @@ SCALE_SAMPLE = 100_000
 """At most about this many residuals decide the scale of a robust loss."""
 
 
+def _name_up(where: Callable[[int], str], poses: Iterable[int]) -> bool:
+    """Whether a pose's name says which way an axis points."""
+    names = (where(pose) for pose in poses)
+    first = next(names, "")
+    if not first.startswith("position "):  # the number of a line, as are all others
+        return False
+    return axis_up(first) is not None or any(axis_up(name) is not None for name in names)
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Poses of R sensors, J at most; a sensor with fewer repeats its last one, and the repetitions count nothing.
@@ -46,9 +57,11 @@ class Sample:
         lower, upper: least and greatest output of each axis, shape (R, 3), output units.
         blocks: the outputs, shape (R, B, 3) a block, output units.
         doubtful: whether `readings` has warnings, or might have, shape (R,).
+        labelled: whether a label makes each pose an attitude of its own, shape (R,).
         readings: of each sensor by its number, from 0: origin, names of the poses, notes and warnings of the reader.
         count: raw readings behind each pose, shape (R, J); scatter: standard deviation of one of them, shape
-            (R, J, 3), output units; NaN where not known, None where nothing tells.
+            (R, J, 3), output units; cross: covariances xy, xz, yz of one, shape (R, J, 3), output units squared; NaN
+            where not known, None where nothing tells.
         reference: known specific force, shape (R, J, 3), m/s^2; temperature: shape (R, J); None where there is none.
     """
 
@@ -57,9 +70,11 @@ class Sample:
     upper: Float
     blocks: Blocks
     doubtful: Bool
+    labelled: Bool
     readings: Callable[[int], Readings]
     count: Float | None = None
     scatter: Float | None = None
+    cross: Float | None = None
     reference: Float | None = None
     temperature: Float | None = None
 
@@ -84,10 +99,17 @@ class Sample:
             lower=np.stack([one.lower for one in readings]),
             upper=np.stack([one.upper for one in readings]),
             blocks=blocks,
-            doubtful=np.array([bool(one.warnings) for one in readings]),
+            doubtful=np.array(
+                [
+                    bool(one.warnings) or _name_up(one.where, range(min(one.poses, LOOKED_AT)))
+                    for one in readings
+                ]
+            ),
+            labelled=np.array([one.labels is not None for one in readings]),
             readings=readings.__getitem__,
             count=stack("count"),
             scatter=stack("scatter"),
+            cross=stack("cross"),
             reference=stack("reference"),
             temperature=stack("temperature"),
         )
@@ -95,16 +117,20 @@ class Sample:
     @classmethod
     def of_batch(cls, fleet: FleetReadings, batch: Batch) -> Sample:
         """Return the sample of a batch of a fleet."""
-        doubtful = may_be_doubtful(batch.output[:, :LOOKED_AT], batch.count) | (batch.count >= RAW_ROWS)
+        doubtful = fleet.doubtful(batch)
+        if _name_up(fleet.where, batch.pose[:1].ravel().tolist()):  # one table, one kind of labels
+            doubtful = np.ones_like(doubtful)
         return cls(
             poses=batch.count,
             lower=batch.output.min(axis=1),
             upper=batch.output.max(axis=1),
             blocks=lambda: iter([(0, batch.output)]),
             doubtful=doubtful,
+            labelled=fleet.labelled(batch),
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
             scatter=batch.scatter,
+            cross=batch.cross,
         )
 
     def __len__(self) -> int:
@@ -124,7 +150,7 @@ class Sample:
         numbers = index.tolist()
         parts = {
             name: None if (value := getattr(self, name)) is None else value[index]
-            for name in ("count", "scatter", "reference", "temperature")
+            for name in ("count", "scatter", "cross", "reference", "temperature")
         }
         return replace(
             self,
@@ -133,6 +159,7 @@ class Sample:
             upper=self.upper[index],
             blocks=lambda: ((first, block[index]) for first, block in self.blocks()),
             doubtful=self.doubtful[index],
+            labelled=self.labelled[index],
             readings=lambda at: self.readings(numbers[at]),
             **parts,
         )
@@ -142,20 +169,19 @@ class Sample:
         lower, upper = output.min(axis=1), output.max(axis=1)
         return replace(self, lower=lower, upper=upper, blocks=lambda: iter([(0, output)]))
 
-    def weights(self, choice: Weights) -> Float | None:
-        """Return the weights of the poses, mean 1 per sensor, 0 for repetitions, shape (R, J), or None for all alike.
+    def counts(self, choice: Weights) -> Float | None:
+        """Return weights by how many raw readings a pose is the mean of, or None for all alike; see `normalised`.
 
-        n: how many raw readings a pose is the mean of; sd: those over the variance of one. Weights of a sensor whose
-        readings do not give them (see `without_weights`) mean nothing.
+        For choices other than `n` the poses count alike.
         """
         real = self.real(0, int(self.poses.max()))
-        if choice == "none" or self.count is None:
+        if choice != "n" or self.count is None:
             return None if real.all() else real.astype(float)
-        weights = self.count.astype(float)
-        if choice == "sd" and self.scatter is not None:
-            square = np.mean(self.scatter**2, axis=2)
-            weights = np.divide(weights, square, out=np.full(weights.shape, np.nan), where=square > 0)
-        weights = np.where(real, weights, 0.0)
+        return self.normalised(self.count)
+
+    def normalised(self, weights: Float) -> Float:
+        """Return weights, shape (R, J), with mean 1 per sensor and 0 for repetitions; NaN where one is not known."""
+        weights = np.where(self.real(0, weights.shape[1]), weights, 0.0)
         mean: Float = weights.sum(axis=1, keepdims=True) / self.poses[:, None]
         return weights / mean
 
@@ -172,19 +198,17 @@ class Sample:
             usable &= (choice == "auto") | (scatter > 0).any(axis=2)
         return np.asarray((~usable & self.real(0, count.shape[1])).any(axis=1))
 
-    def explained(self, first: int, f: Float, K: Float) -> Float:
-        """Return the variance of the modulus that the scatter of each pose explains, (m/s^2)^2, shape (R, B), or NaN.
-
-        Args:
-            first: number of the first of B poses; f: their specific force, m/s^2, shape (R, B, 3).
-            K: of the sensors, output units per m/s^2, shape (R, 3, 3).
-        """
-        if self.scatter is None or self.count is None:
-            return np.full(f.shape[:2], np.nan)
-        part = slice(first, first + f.shape[1])
-        u = f / np.linalg.norm(f, axis=2, keepdims=True)
-        force = self.scatter[:, part] / np.einsum("rii->ri", K)[:, None, :]
-        return np.asarray(np.sum((u * force) ** 2, axis=2) / self.count[:, part])
+    def faults(self, choice: Weights) -> list[str]:
+        """Return why each sensor cannot be calibrated with these weights, in a sentence, or nothing."""
+        words = [""] * len(self)
+        for at in np.flatnonzero(self.without_weights(choice)).tolist():
+            words[at] = f"--weights {choice} needs {NEEDS[choice]}"
+        for at in np.flatnonzero(~(self.upper > self.lower).any(axis=1)).tolist():
+            poses = int(self.poses[at])
+            words[at] = (
+                f"nothing to calibrate: {'only one pose' if poses == 1 else f'all {poses} poses are equal'}"
+            )
+        return words
 
     def errors(self, K: Float, D: Float, g: float) -> Iterator[tuple[int, Float, Float]]:
         """Yield (first pose, e, f) block by block: e = (g^2 - |f|^2) / 2g and f, m/s^2, shapes (R, B) and (R, B, 3).
@@ -197,14 +221,23 @@ class Sample:
             f = K_A @ np.subtract(block.swapaxes(1, 2), D[..., None], order="C")
             yield first, (g * g - np.einsum("rij,rij->rj", f, f)) / (2.0 * g), f.swapaxes(1, 2)
 
-    def noise(self, K: Float, D: Float, g: float) -> Float:
-        """Return a robust standard deviation of e, m/s^2, shape (R,): its median absolute value times 1.4826."""
+    def noise(self, K: Float, D: Float, g: float, weights: Float | None) -> Float:
+        """Return a robust standard deviation of sqrt(w) e, m/s^2, shape (R,): 1.4826 times the median absolute value.
+
+        Poses with weight 0 do not count.
+        """
         poses = int(self.poses.max())
         stride = max(1, poses // SCALE_SAMPLE)
-        sizes = [np.abs(e)[:, (-first) % stride :: stride] for first, e, _ in self.errors(K, D, g)]
+        sizes = []
+        for first, e, _ in self.errors(K, D, g):
+            part = slice((-first) % stride, None, stride)
+            root = np.ones_like(e) if weights is None else np.sqrt(weights[:, first : first + e.shape[1]])
+            sizes.append(np.where(root > 0, np.abs(root * e), np.nan)[:, part])
+        size = np.concatenate(sizes, axis=1)
+        counted = np.count_nonzero(~np.isnan(size), axis=1) * (poses / size.shape[1])
         # Nine parameters follow the smallest residuals: the factor gives the scale back what they took.
-        freedom = max(1.0, poses - 9.0) / poses
-        return np.asarray(NORMAL_MAD * np.median(np.concatenate(sizes, axis=1), axis=1) / np.sqrt(freedom))
+        freedom = np.maximum(1.0, counted - 9.0) / counted
+        return np.asarray(NORMAL_MAD * np.nanmedian(size, axis=1) / np.sqrt(freedom))
 
     def reweighted(
         self, K: Float, D: Float, settings: Settings, noise: Float, weights: Float | None

@@ -13,11 +13,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.problem import Loetters, compress, opened
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.calibration.consensus import consensus
+from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.triangle import compress
+from accelcal_cli.calibration.weights import (
+    SURELY_TREMBLES,
+    PoseNoise,
+    Tremor,
+    directions,
+    pose_noise,
+    tremor,
+)
 from accelcal_cli.optimization.minimize import Run, minimize, polish
 
 SAME_MINIMUM = 1e-6
@@ -49,9 +59,12 @@ class Stated:
     """The problem of R sensors as it is stated.
 
     Attributes:
-        sample: their readings; settings: of the calibration.
-        weights: of the poses, shape (R, J), or None.
+        sample: their readings, with the length that trembling took given back; settings: of the calibration.
+        weights: of the poses, 0 for those that are left out, shape (R, J), or None.
         cost: the Loetters cost in its box; sources: where the box of each sensor comes from, see `search_box`.
+        noise: of the poses by the scatter of their readings; tremor: what was given back; None where nothing tells.
+        rejected: poses that disagree with the others, left out by a robust loss, shape (R, J), or None.
+        own: with weights `auto`: sum e^2 / v and its degrees of freedom, of a fit weighted by 1 / v alone.
     """
 
     sample: Sample
@@ -59,6 +72,17 @@ class Stated:
     weights: Float | None
     cost: Loetters
     sources: tuple[str, ...]
+    noise: PoseNoise | None = None
+    tremor: Tremor | None = None
+    rejected: Bool | None = None
+    own: tuple[float, int] | None = None
+
+    def with_weights(self, weights: Float | None) -> Stated:
+        """Return the same problem with other weights, and the poses that are rejected still left out."""
+        if self.rejected is not None and self.rejected.any():
+            weights = np.where(self.rejected, 0.0, 1.0 if weights is None else weights)
+        cost, sources = opened(self.sample, self.settings, weights)
+        return replace(self, weights=weights, cost=cost, sources=sources)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +112,17 @@ class Slopes:
 
     Attributes:
         temperature: the slopes.
-        sample: the readings at the reference temperature.
         loss: information that the slopes take from the nine, shape (R, 9, 9).
+        sensor: K, gauge `lower`, and D at the reference temperature, shapes (R, 3, 3) and (R, 3).
+        rows: the design of the nine parameters without what the slopes take, and of the slopes, shape (R, J, 15).
+        cofactor: of the slopes, shape (R, 6, 6).
     """
 
     temperature: Temperature
-    sample: Sample
     loss: Float
+    sensor: tuple[Float, Float]
+    rows: Float
+    cofactor: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +131,7 @@ class Solution:
 
     Attributes:
         stated: the problem; search: how it was searched.
+        sample: the readings that were fitted: with slopes, those at the reference temperature.
         cost: the Loetters cost as last solved, with the weights of a robust loss; plain: without them.
         x: the best point of each sensor, shape (R, D); value: L there, shape (R,), (m/s^2)^4.
         noise: robust standard deviation of e, m/s^2, shape (R,); None without a robust loss.
@@ -112,6 +141,7 @@ class Solution:
 
     stated: Stated
     search: Search
+    sample: Sample
     cost: Loetters
     plain: Loetters
     x: Float
@@ -120,10 +150,13 @@ class Solution:
     slopes: Slopes | None = None
     notes: tuple[str, ...] = ()
 
-    @property
-    def sample(self) -> Sample:
-        """The readings that were fitted: with slopes, those at the reference temperature."""
-        return self.stated.sample if self.slopes is None else self.slopes.sample
+    def robust_weights(self) -> Float | None:
+        """Return the weights of the poses with those of a robust loss, shape (R, J), or None where all count alike."""
+        weights, noise, settings = self.stated.weights, self.noise, self.stated.settings
+        if noise is None or (noise <= NO_NOISE * settings.g).all():
+            return weights
+        parts = self.sample.reweighted(*self.cost.parameters(self.x), settings, noise, weights)
+        return np.concatenate([np.asarray(weight) for _, weight in parts], axis=1)
 
     def solved_anew(self, cost: Loetters) -> Solution:
         """Return the solution carried over to a cost that differs a little: polished from where it was."""
@@ -134,10 +167,61 @@ class Solution:
 
 def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
-    weights = None if settings.weights == "auto" else sample.weights(settings.weights)
-    cost, sources = opened(sample, settings, weights)
-    stated = Stated(sample, settings, weights, cost, sources)
-    return _shared(stated) if settings.weights == "auto" else stated
+    counts = sample.counts(settings.weights)
+    cost, sources = opened(sample, settings, counts)
+    stated = Stated(sample, settings, counts, cost, sources)
+    if sample.scatter is not None and sample.count is not None:
+        stated = _with_noise(stated)
+    if settings.robust != "none":
+        stated = agreed(stated)
+    elif stated.noise is not None and settings.weights in ("sd", "auto"):
+        stated = stated.with_weights(own_weights(stated))
+    return _shared(stated) if settings.weights == "auto" and stated.noise is not None else stated
+
+
+def agreed(stated: Stated) -> Stated:
+    """Return the problem of one sensor without the poses that disagree with the others, weighted as is asked for."""
+    agreement = consensus(stated.sample, stated.settings)
+    rejected = None if agreement is None or agreement.agreeing.all() else ~agreement.agreeing[None]
+    return replace(stated, rejected=rejected).with_weights(own_weights(stated))
+
+
+def own_weights(stated: Stated) -> Float | None:
+    """Return the weights asked for, before a pose is left out or an error is shared, shape (R, J), or None."""
+    if stated.noise is not None and stated.settings.weights in ("sd", "auto"):
+        return stated.sample.normalised(_inverse(stated.noise.variance))
+    return stated.sample.counts(stated.settings.weights)
+
+
+def _inverse(variance: Float) -> Float:
+    """Return 1 / v, shape (R, J); a pose without any noise weighs as the quietest one with some."""
+    least = np.where(variance > 0, variance, np.inf).min(axis=1, keepdims=True)
+    return np.asarray(1.0 / np.maximum(variance, np.where(np.isfinite(least), least, 1.0)))
+
+
+def _with_noise(stated: Stated) -> Stated:
+    """Return the problem with what the scatter within its poses tells: their noise, and trembling, given back."""
+    sample, g = stated.sample, stated.settings.g
+    K, D = first_sensors(stated.cost)
+    trembling = tremor(sample, K, D, g)
+    if trembling is not None and (trembling.certainty > SURELY_TREMBLES).any():
+        shakes = (trembling.certainty > SURELY_TREMBLES)[:, None]
+        longer = directions(sample, K, D) * np.where(shakes, trembling.excess / g, 0.0)[..., None]
+        sample = sample.with_output(sample.output() + longer @ K.swapaxes(1, 2))
+        cost, sources = opened(sample, stated.settings, stated.weights)
+        stated = replace(stated, sample=sample, tremor=trembling, cost=cost, sources=sources)
+        K, D = first_sensors(cost)
+    return replace(stated, noise=pose_noise(sample, K, D, stated.tremor))
+
+
+def first_sensors(cost: Loetters) -> tuple[Float, Float]:
+    """Return K, shape (R, 3, 3), and D, shape (R, 3), that readings are first seen with: of least cost near the box."""
+    x = cost.least_cost()
+    poor = ~(np.abs(np.nan_to_num(x, nan=np.inf)) <= 1.0).all(axis=1)
+    if poor.any():
+        index = np.flatnonzero(poor)
+        x[index] = polish(cost.of(index), np.zeros((len(index), cost.unknowns))).x
+    return cost.parameters(x)
 
 
 def search(stated: Stated, *, closed: bool = False) -> Solution:
@@ -167,7 +251,7 @@ def search(stated: Stated, *, closed: bool = False) -> Solution:
     row = np.arange(sensors) * runs + best
     spent = evaluations.reshape(sensors, runs).sum(axis=1)
     found = Search(settings.optimizer, runs, run.cost[row], spent, agreeing, run, row)
-    return Solution(stated, found, cost, cost, x[row], least)
+    return Solution(stated, found, stated.sample, cost, cost, x[row], least)
 
 
 def _searched(cost: Loetters, settings: Settings, sensors: int) -> Run:
@@ -212,7 +296,7 @@ def reweight(solution: Solution) -> Solution:
         return solution
     for _ in range(REWEIGHTINGS):
         K, D = solution.cost.parameters(solution.x)
-        noise = sample.noise(K, D, settings.g)
+        noise = sample.noise(K, D, settings.g, solution.stated.weights)
         if (noise <= NO_NOISE * settings.g).all():  # noise-free readings: every weight is 1
             return replace(solution, noise=noise)
         triangle = solution.cost.triangle
@@ -226,26 +310,42 @@ def reweight(solution: Solution) -> Solution:
 
 
 def _shared(stated: Stated) -> Stated:
-    """State a problem anew with weights that follow the scatter of the poses and what they share; J > 9 tells it."""
-    sample, settings = stated.sample, stated.settings
-    if sample.poses.max() <= 9 or sample.count is None or sample.scatter is None:
-        return stated
+    """State a problem anew with weights that follow the scatter of the poses and what they share; J > 9 tells it.
+
+    It comes weighted by the scatter alone.
+    """
     before = -1.0
     for _ in range(SHARED_ROUNDS):
-        x = polish(stated.cost, np.zeros_like(stated.cost.box.centre)).x
-        K, D = stated.cost.parameters(x)
-        parts = list(sample.errors(K, D, settings.g))
-        errors, force = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
-        own = sample.explained(0, force, K)
-        shared = shared_variance(errors[0], own[0], int(sample.poses[0]) - 9)
-        shared = max(shared, LEAST_SHARED * float(own.mean()))
+        K, D = stated.cost.parameters(polish(stated.cost, np.zeros_like(stated.cost.box.centre)).x)
+        stated, shared = share(stated, stated.sample, (K, D), 9)
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
-        before, weights = shared, 1.0 / (shared + own)
-        weights = weights / weights.mean()
-        cost, sources = opened(sample, settings, weights)
-        stated = Stated(sample, settings, weights, cost, sources)
+        before = shared
     return stated
+
+
+def share(
+    stated: Stated, sample: Sample, sensors: tuple[Float, Float], parameters: int
+) -> tuple[Stated, float]:
+    """Return the problem of one sensor with weights 1 / (m^2 + v), and m^2, (m/s^2)^2; 0 where nothing tells it.
+
+    Args:
+        stated: the problem; sample: its readings, at one temperature.
+        sensors: K and D that fit them best by the present weights, from so many parameters.
+    """
+    counted = (
+        ~stated.rejected[0] if stated.rejected is not None else np.ones(int(sample.poses[0]), dtype=bool)
+    )
+    freedom = int(counted.sum()) - parameters
+    if freedom < 1 or stated.noise is None:
+        return stated, 0.0
+    own = stated.noise.variance[0]
+    e = np.concatenate([part[0] for _, part, _ in sample.errors(*sensors, stated.settings.g)])
+    if stated.own is None and (own > 0).all():
+        stated = replace(stated, own=(float(np.sum(e[counted] ** 2 / own[counted])), freedom))
+    shared = max(shared_variance(e[counted], own[counted], freedom), LEAST_SHARED * float(own.mean()))
+    weights = sample.normalised(1.0 / (shared + own)[None])
+    return stated.with_weights(weights), shared
 
 
 def shared_variance(errors: Float, own: Float, freedom: int) -> float:

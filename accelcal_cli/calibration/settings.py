@@ -104,7 +104,7 @@ class Settings:
         Raises:
             ConfigError: unknown optimizer or parameter.
         """
-        return OPTIMIZERS.build(self.optimizer, self.parameters, f"optimizer {self.optimizer}")
+        return from_mapping(OPTIMIZERS.get(self.optimizer), self.parameters, f"optimizer {self.optimizer}")
 
 
 def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:

@@ -13,16 +13,29 @@ from dataclasses import replace
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK, moved_sensor
 from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.search import SLOPES, Slopes, Solution
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import (
+    SHARED_ROUNDS,
+    SHARED_SETTLED,
+    SLOPES,
+    Slopes,
+    Solution,
+    agreed,
+    reweight,
+    share,
+)
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
 SMALLEST_RANGE = 5.0
 """Degrees between the coldest and the warmest pose below which slopes would be extrapolated at once."""
 
 MOST_POSES = 100_000
+ROBUST_ROUNDS, ROBUST_SETTLED = 10, 0.1
+"""Rounds at most in which slopes and robust weights follow each other, and the part of a sigma that ends them."""
+
 STEPS, SETTLED = 30, 1e-12
 """Gauss-Newton steps at most, and the step, as part of g, that ends them."""
 
@@ -37,20 +50,75 @@ def with_slopes(solution: Solution) -> Solution:
         return solution
     degrees = sample.temperature[0]
     why = _unsuitable(solution, degrees)
-    slopes = None if why else _fit(solution, degrees)
-    if slopes is None:
+    fitted = None
+    if not why:
+        solution, fitted = _settled(solution, degrees)
+    if fitted is None:
         why = why or "the poses do not determine slopes with temperature"
         return replace(solution, notes=(*solution.notes, f"Temperature column not used: {why}."))
-    triangle = packed(slopes.sample, solution.stated.weights, within=sample)
-    cost = Loetters(triangle, settings.g, solution.cost.box)
+    slopes, brought = fitted
+    plain, cost = (
+        Loetters(packed(brought, weights, within=sample), settings.g, solution.cost.box)
+        for weights in (solution.stated.weights, solution.robust_weights())
+    )
     middle = slopes.temperature.reference
     note = f"Scale factors and biases are linear in temperature; the others hold at {middle:.4g} degrees."
-    return replace(solution.solved_anew(cost), plain=cost, slopes=slopes, notes=(*solution.notes, note))
+    notes = (*solution.notes, note)
+    return replace(solution.solved_anew(cost), sample=brought, plain=plain, slopes=slopes, notes=notes)
 
 
-def _fit(solution: Solution, degrees: Float) -> Slopes | None:
-    """Return the slopes of poses of these temperatures, shape (J,), or None where they do not determine them."""
-    sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.stated.weights
+def _settled(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes, Sample] | None]:
+    """Return the solution with the weights that go with slopes, and these as `_fit` does: they leave a shared error."""
+    if solution.stated.settings.robust != "none":
+        return _robust(solution, degrees)
+    fitted, stated = _fit(solution, degrees), solution.stated
+    if fitted is None or stated.settings.weights != "auto" or stated.noise is None:
+        return solution, fitted
+    weights = stated.sample.normalised(1.0 / stated.noise.variance)
+    stated, before = replace(stated.with_weights(weights), own=None), -1.0
+    for _ in range(SHARED_ROUNDS):
+        solution = replace(solution, stated=stated)
+        fitted = _fit(solution, degrees)
+        if fitted is None:
+            return solution, None
+        stated, shared = share(stated, fitted[1], fitted[0].sensor, 9 + SLOPES)
+        if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
+            break
+        before = shared
+    solution = replace(solution, stated=stated)
+    return solution, _fit(solution, degrees)
+
+
+def _robust(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes, Sample] | None]:
+    """Return a robust solution with slopes: readings brought to one temperature say anew which of them agree.
+
+    Drift makes sound poses look wrong at first; as the slopes come out, they come back.
+    """
+    readings = solution.stated.sample
+    fitted, before = _fit(solution, degrees), np.full(6, np.inf)
+    for _ in range(ROBUST_ROUNDS):
+        if fitted is None:
+            return solution, None
+        slopes, brought = fitted
+        here = np.concatenate([slopes.temperature.scale, slopes.temperature.bias])
+        sigma = np.concatenate([slopes.temperature.sigma_scale, slopes.temperature.sigma_bias])
+        if (np.abs(here - before) <= ROBUST_SETTLED * sigma).all():
+            break
+        before = here
+        stated = agreed(replace(solution.stated, sample=brought))
+        x = stated.cost.coordinates(*slopes.sensor)
+        start = replace(solution, stated=stated, sample=brought, cost=stated.cost, plain=stated.cost, x=x)
+        solution = reweight(start.solved_anew(stated.cost))
+        fitted = _fit(replace(solution, stated=replace(stated, sample=readings)), degrees)
+    return replace(solution, stated=replace(solution.stated, sample=readings)), fitted
+
+
+def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
+    """Return the slopes, and the readings brought to the reference temperature; None where nothing determines them.
+
+    `degrees`: temperatures of the poses, shape (J,).
+    """
+    sample, g, weights = solution.stated.sample, solution.stated.settings.g, solution.robust_weights()
     K, D = solution.cost.parameters(solution.x)
     low = ErrorModel(to_gauge(K[0], "lower"), D[0])
     N = sample.output()[0]
@@ -69,7 +137,7 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
         p = p + step
         if np.abs(step).max() <= SETTLED * g:
             break
-    s = float(np.sqrt((root * e) @ (root * e) / (len(N) - 9 - SLOPES)))
+    s = float(np.sqrt((root * e) @ (root * e) / max(np.count_nonzero(root) - 9 - SLOPES, 1)))
     units = np.repeat([1.0 / g, 1.0], 3) * np.concatenate([np.ones(3), np.diagonal(low.K)]) / half
     (scale, bias), (sigma_scale, sigma_bias) = np.split(p[9:] * units, 2), np.split(s * dop * units, 2)
     temperature = Temperature(
@@ -85,15 +153,19 @@ def _fit(solution: Solution, degrees: Float) -> Slopes | None:
         dop=dop,
     )
     B, C = information[:9, 9:], information[9:, 9:]
-    brought = temperature.at_reference(N, degrees, _moved(low, p, g).D)
-    return Slopes(temperature, sample.with_output(brought[None]), (B @ np.linalg.solve(C, B.T))[None])
+    sensor = _moved(low, p, g)
+    brought = temperature.at_reference(N, degrees, sensor.D)
+    part = np.linalg.solve(C, B.T)
+    # What the slopes' columns take from those of the nine parameters does not determine these.
+    rows = np.column_stack([J[:, :9] - J[:, 9:] @ part, J[:, 9:]])
+    found = sensor.K[None], sensor.D[None]
+    slopes = Slopes(temperature, (B @ part)[None], found, rows[None], np.linalg.inv(C)[None])
+    return slopes, sample.with_output(brought[None])
 
 
 def _unsuitable(solution: Solution, degrees: Float) -> str:
     """Return why temperatures, shape (J,), cannot be used, or nothing."""
     settings, poses = solution.stated.settings, len(degrees)
-    if settings.robust != "none":
-        return "slopes with temperature go with plain least squares only"
     if not settings.misalignment:
         return "slopes with temperature are fitted beside misalignments only"
     if poses > MOST_POSES:
@@ -109,10 +181,8 @@ def _unsuitable(solution: Solution, degrees: Float) -> str:
 
 def _moved(low: ErrorModel, p: Float, g: float) -> ErrorModel:
     """Return the sensor of gauge `lower` at the first nine parameters, m/s^2."""
-    E = np.zeros((3, 3))
-    for value, (i, j) in zip(p[:6], ROWS_COLUMNS[:6], strict=True):
-        E[i, j] = value / g
-    return ErrorModel(low.K @ np.linalg.inv(np.eye(3) + E), low.D + np.diagonal(low.K) * p[6:9])
+    K, D = moved_sensor(low.K[None], low.D[None], p[None, :9], g)
+    return ErrorModel(K[0], D[0])
 
 
 def _linearised(N: Float, t: Float, low: ErrorModel, p: Float, g: float) -> tuple[Float, Float]:

@@ -17,12 +17,14 @@ in_force = options.panel("Specific force")
 
 
 def command(
+    *,
     result: options.ResultFile,
     data: Annotated[
         str,
         typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.", rich_help_panel="Input"),
     ],
     columns: options.Columns = None,
+    form: options.TextOptions,
     force: options.Force = False,
     unit: Annotated[
         str | None,
@@ -56,6 +58,7 @@ def command(
     text. The log streams through: memory does not grow with it.
     """
     from accelcal_cli.calibration.apply import ColumnOptions, prepare
+    from accelcal_cli.io.columns import restrict
     from accelcal_cli.io.reader import open_table
     from accelcal_cli.output.files import whole_file
 
@@ -65,8 +68,10 @@ def command(
     calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)
     options.warn(result, calibration.warnings, quiet)
-    table = open_table(data, sys.stdin.buffer, hashed=False)
+    read = form.read_options()
+    table = open_table(data, sys.stdin.buffer, hashed=False, options=read)
     try:
+        restrict(table, read.where)
         log = prepare(calibration, table, options.split_columns(columns), wanted)
         parquet = Path(output).suffix.lower() in PARQUET
         if parquet and not log.parquet:

@@ -77,6 +77,7 @@ def command(
             format, lambda: poses, lambda: views.blocks(detection), lambda: views.record(detection)
         )
     sys.stdout.flush()
+    options.warn(data, detection.warnings, quiet)
     options.tell_written([output], quiet)
     _draw(detection, plot, quiet)
 

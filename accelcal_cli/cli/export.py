@@ -68,6 +68,7 @@ def command(
     """
     from accelcal_cli.exporters.base import EXPORTERS
     from accelcal_cli.output.files import whole_file
+    from accelcal_cli.schema import from_mapping
 
     cls = EXPORTERS.get(to)
     stated = options.stated(**vars(target))
@@ -77,7 +78,7 @@ def command(
             raise UsageError(
                 f"--{option.replace('_', '-')} does not apply to --to {to}; it applies to {', '.join(takers)}"
             )
-    exporter = EXPORTERS.build(to, stated, f"--to {to}")
+    exporter = from_mapping(cls, stated, f"--to {to}")
     options.check_files([result], {"-o": output})
     if cls.binary and output == "-" and sys.stdout.isatty():
         raise UsageError(f"--to {to} is not text for a terminal; name a file with -o")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -163,11 +164,11 @@ def _show(fleet: Fleet, readings: FleetReadings, settings: Settings, format: str
     from accelcal_cli.views import fleet as fleet_tables
 
     outlying = standouts(fleet, settings.g)
-    rows = fleet_tables.sensors(fleet, readings.sensors, outlying)
+    rows = cache(partial(fleet_tables.sensors, fleet, readings.sensors, outlying))  # made when asked for
     if output is not None:
-        write_table(rows, output)
+        write_table(rows(), output)
     options.print_result(
-        format, lambda: rows, lambda: fleet_tables.blocks(fleet, readings.sensors, outlying, settings.g)
+        format, rows, partial(fleet_tables.blocks, fleet, readings.sensors, outlying, settings.g)
     )
 
 

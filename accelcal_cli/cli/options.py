@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from accelcal_cli.errors import UsageError, did_you_mean, visible
+from accelcal_cli.registry import is_mentioned
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
@@ -60,17 +61,11 @@ def classes_in(package: str, group: str) -> list[str]:
     """
     modules = (module.name for module in pkgutil.iter_modules(import_module(package).__path__))
     names = {name.replace("_", "-") for name in modules if name != "base"}
-    if _is_mentioned(group):
+    if is_mentioned(group):
         from importlib.metadata import entry_points
 
         names.update(point.name for point in entry_points(group=group))
     return sorted(names)
-
-
-def _is_mentioned(group: str) -> bool:
-    """Return whether an installed package may have entry points of a group: `importlib.metadata` is slow to import."""
-    files = (file for folder in sys.path for file in Path(folder).glob("*-info/entry_points.txt"))
-    return any(f"[{group}]" in file.read_text("utf-8", errors="replace") for file in files)
 
 
 optimizers = partial(classes_in, "accelcal_cli.optimization.algorithms", "accelcal.optimizers")
@@ -227,8 +222,12 @@ class GravityOptions:
 
 @dataclass(frozen=True)
 class TextOptions:
-    """What a user knows of the form of a text."""
+    """Which rows of a table to read, and what a user knows of its form."""
 
+    where: Annotated[
+        list[str] | None,
+        in_input(help="Read only rows with this value, as device=0; repeatable.", metavar="COLUMN=VALUE"),
+    ] = None
     skip_rows: Annotated[
         int | None, in_input(help="Lines at the beginning that are not looked at.", min=0, metavar="N")
     ] = None
@@ -257,7 +256,9 @@ class TextOptions:
         """Return the options as the library takes them."""
         from accelcal_cli.io.reader import ReadOptions
 
-        return ReadOptions(self.skip_rows or 0, bool(self.skip_bad), self.line, self.count)
+        return ReadOptions(
+            self.skip_rows or 0, bool(self.skip_bad), self.line, self.count, tuple(self.where or ())
+        )
 
 
 LARGEST_MULTIPLIER = 1e6
@@ -348,7 +349,7 @@ class DetectionOptions:
             data: file, or - for standard input.
             columns: option --columns.
             gravity: returns local gravity in the unit that the file states.
-            form: what is known of the form of a text.
+            form: which rows to read, and what is known of their form.
             picture: keep what a picture of the log needs.
         """
         from accelcal_cli.detection.detect import detect

@@ -106,9 +106,9 @@ def _so_far(
     options.check_input(data)
     stdin = io.BufferedReader(cast("Any", sys.stdin.buffer)) if data == "-" else None
     if Path(data).suffix in RESULTS or (stdin is not None and is_result(_head(stdin))):
-        if columns is not None or gravity.stated() is not None:
+        if columns is not None or form.where or gravity.stated() is not None:
             raise UsageError(
-                f"{data}: a result file has its own columns and g; leave out --columns, --g and --latitude"
+                f"{data}: a result file has its own columns and g; leave out --columns, --where, --g and --latitude"
             )
         return load_result(data if stdin is None else "<stdin>", stdin)
     readings = read_readings(data, options.split_columns(columns), stdin=stdin, options=form.read_options())

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Int
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.observability import Observability, attitudes, directions_of
 from accelcal_cli.calibration.sample import Sample
@@ -25,11 +25,15 @@ from accelcal_cli.detection.intervals import (
     find_intervals,
     find_level,
     merge,
+    sample_windows,
 )
+from accelcal_cli.detection.log_screening import Liveliness, alternating, check_gravity
 from accelcal_cli.detection.rawlog import RawLog
-from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, read_tiles
+from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, read_tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import InputForm, Readings
+from accelcal_cli.io.screening import LOOKED_AT, Screened
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
@@ -100,6 +104,7 @@ class Detection:
         intervals: the poses.
         form: of the file.
         envelope: of the log, for a picture; None unless asked for.
+        warnings: what the rows show that is no rest.
     """
 
     source: str
@@ -116,11 +121,28 @@ class Detection:
     notes: tuple[str, ...]
     form: InputForm
     envelope: Envelope | None = None
+    warnings: tuple[Notice, ...] = ()
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
-        return readings_of(self.intervals, self.source).known_as(
-            self.sha256, self.columns, (*self.notes, self.summary()), self.intervals.where, form=self.form
+        intervals, notes = self.intervals, (*self.notes, self.summary())
+        readings = readings_of(intervals, self.source)
+        said = {notice.key for notice in self.warnings}
+        first = slice(LOOKED_AT)
+        screened = Screened(
+            intervals.mean[first],
+            self.columns,
+            len(intervals),
+            intervals.where,
+            self.source,
+            single=False,
+            warm=readings.temperature is not None,
+            count=intervals.n[first].astype(float),
+            scatter=intervals.scatter[first],
+        )
+        more = [notice for notice in screened.notices() if notice.key not in said]
+        return readings.known_as(
+            self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more), self.form
         )
 
     def summary(self) -> str:
@@ -158,14 +180,22 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     rate = settings.rate if settings.rate is not None else log.clock.rate
     lengths = settings.spans.rows(rate)
     envelope = Envelope(lengths.tile) if picture else None
+    in_turn = alternating(*_parted(log))
     tiles = read_tiles(log, lengths, envelope)
-    level = find_level(tiles, lengths, log.name)
+    level, lively = _screened(tiles, lengths, log)
     segmentations = find_intervals(tiles, lengths, level, settings.multipliers)
     candidates = tuple(evaluate(segmentation, settings.g) for segmentation in segmentations)
     enough = [k for k, c in enumerate(candidates) if c.attitudes >= settings.least_poses]
     kept = best(enough, candidates) if enough else nearest(segmentations, candidates)
     intervals = segmentations[kept].intervals
     gaps = tiles.gaps.notes(log.clock.unit)
+    zeros, shown = log.zeros, intervals if not enough else _combine(intervals, settings)
+    warnings = (
+        *in_turn,
+        *lively.clipped(shown, log.columns.names),
+        *lively.notices(tiles.size),
+        *zeros.notices(log.where, tiles.rows - zeros.count),
+    )
     detection = Detection(
         source=log.name,
         sha256=log.sha256,
@@ -176,16 +206,36 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         level=level,
         multiplier=candidates[kept].multiplier,
         candidates=candidates,
-        intervals=_combine(intervals, settings) if enough else intervals,
+        intervals=shown,
         settings=settings,
         notes=(*log.notes, *gaps),
         form=replace(log.form, rows=tiles.rows, rate_hz=rate),
+        warnings=warnings,
         envelope=envelope,
     )
     if not enough:
         why = explain_too_few(segmentations[kept], candidates[kept], detection)
         raise TooFewPosesError("; ".join([f"{log.name}: {why}", *gaps]), detection)
     return detection
+
+
+def _parted(log: RawLog) -> tuple[Float, Float | None]:
+    """Return acceleration and time of the first rows of a log."""
+    head = log.head()
+    return head[:, :3], None if log.columns.time is None else head[:, -1]
+
+
+def _screened(tiles: Tiles, lengths: RowLengths, log: RawLog) -> tuple[StillLevel, Liveliness]:
+    """Leave out what is frozen, and return what counts as still in the rest; DataError where no gravity turns."""
+    sample = sample_windows(tiles, lengths, log.name)
+    level = find_level(tiles, lengths, log.name, sample)
+    lively = Liveliness.of(tiles, level)
+    tiles.unusable = lively.unusable(tiles)
+    if lively.frozen:
+        sample = sample_windows(tiles, lengths, log.name)
+        level = find_level(tiles, lengths, log.name, sample)
+    check_gravity(sample, level, log.name, log.columns.names, log.gyro_names())
+    return level, lively
 
 
 def evaluate(segmentation: Segmentation, g: float) -> CandidateThreshold:
@@ -234,7 +284,7 @@ def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
 
 
 def readings_of(intervals: Intervals, source: str) -> Readings:
-    """Return the intervals as readings: mean, count and scatter of each."""
+    """Return the intervals as readings, not screened: mean, count, scatter and temperature of each."""
     degrees = intervals.temperature
     return Readings.from_array(
         intervals.mean,
@@ -242,6 +292,7 @@ def readings_of(intervals: Intervals, source: str) -> Readings:
         count=intervals.n,
         scatter=intervals.scatter,
         temperature=None if degrees is None or np.isnan(degrees).all() else degrees,
+        warnings=(),
     )
 
 
@@ -328,7 +379,7 @@ def screen(readings: Readings, g: float) -> tuple[ErrorModel, float, float, str]
             K, D = plain.cost.parameters(middle)
             return ErrorModel(K[0], D[0]), math.nan, math.nan, "undetermined"
     result = fit(search(state(sample, settings), closed=True))
-    view = result.observability[0]
+    view = result.geometry.observability[0]
     verdict = "undetermined" if result.at_wall.any() else view.verdict
     model = ErrorModel(result.lower[0], result.D[0])
     return model, float(result.rms[0]), float(result.s[0]) * float(view.worst), verdict

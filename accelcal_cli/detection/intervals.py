@@ -147,23 +147,30 @@ def find_intervals(
     return segmentations
 
 
-def find_level(tiles: Tiles, lengths: RowLengths, name: str) -> StillLevel:
-    """Return what counts as still.
-
-    Args:
-        tiles: the log; name: of it, for messages.
-        lengths: of window, still period and least interval.
-
-    Raises:
-        DataError: a log shorter than the window or without any noise, a stated still period that is not still.
-    """
+def sample_windows(tiles: Tiles, lengths: RowLengths, name: str) -> list[Windows]:
+    """Return about SAMPLE windows of a log, or all; DataError for a log shorter than one."""
     count = tiles.count - lengths.width + 1
     if count < 1:
         raise DataError(
             f"{name}: has {tiles.rows:,} rows, fewer than one window of {lengths.window:,}; "
             "means of poses at rest go to accelcal calibrate as they are"
         )
-    sample = list(windows(tiles, lengths.width, -(-count // SAMPLE)))
+    return list(windows(tiles, lengths.width, -(-count // SAMPLE)))
+
+
+def find_level(
+    tiles: Tiles, lengths: RowLengths, name: str, sample: Sequence[Windows] | None = None
+) -> StillLevel:
+    """Return what counts as still.
+
+    Args:
+        tiles: the log; name: of it, for messages; sample: its `sample_windows`, if there already.
+        lengths: of window, still period and least interval.
+
+    Raises:
+        DataError: a log without any noise, a stated still period that is not still.
+    """
+    sample = sample_windows(tiles, lengths, name) if sample is None else sample
     mean, variance = np.concatenate([w.mean for w in sample]), np.concatenate([w.variance for w in sample])
     noisy = variance > (ROUNDING * float(np.abs(mean).max())) ** 2
     if not noisy.any():

@@ -17,14 +17,17 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.clock import UNITS, Clock, seconds_of_dates, unit_of
-from accelcal_cli.io.columns import RawColumns, choose_raw
+from accelcal_cli.io.columns import RawColumns, choose_raw, restrict
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
 from accelcal_cli.io.readings import InputForm
+from accelcal_cli.io.rows import OneSensor, ZeroRows
 from accelcal_cli.io.vocabulary import parse_unit
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
 
+HEAD = 20_000
+"""First rows that show whether several sensors take turns, at most."""
 
 CHANGES = 50
 """Changes of time among the first PROBE rows that determine the step."""
@@ -46,10 +49,11 @@ def open_raw_log(
         columns, gyro: three columns each, by name or by number from 1; found by their names when None; no
             gyroscope with `gyro` of ``["none"]``.
         time: a column, ``"none"``, or None to find it.
-        stdin: standard input; options: what the user knows of the form of a text.
+        stdin: standard input; options: what the user knows of the form of a table.
     """
     table = open_table(source, stdin, options=options)
     try:
+        restrict(table, options.where)
         return RawLog(table, choose_raw(table, columns, gyro, time))
     except BaseException:
         table.close()
@@ -63,9 +67,10 @@ class RawLog:
         """Read the first rows of `table` to find out what the time column is."""
         self.name = table.name
         self.columns = columns
+        self.zeros = ZeroRows()
         self._table = table
-        rows = table.blocks(columns.selection())
         dated = columns.dated
+        rows = _of_one(table.blocks(columns.selection()), OneSensor(table, columns.identity, fleet=False))
         self._rows = seconds_of_dates(rows, self._time_at, table.facts.day_first) if dated else rows
         self._head = _first(self._rows, PROBE)
         self.clock = Clock()
@@ -151,10 +156,24 @@ class RawLog:
         )
         for rows in chain(self._head, self._rows):
             numbers = rows.numbers[:, :width]
+            self.zeros.keep(numbers[:, :3], rows.start)
             if timed and len(numbers):
                 self._check_time(numbers[:, -1], last, rows.start)
                 last = float(numbers[-1, -1])
             yield numbers
+
+    def gyro_names(self) -> tuple[str, ...]:
+        """Return the names of the gyroscope columns, or their numbers from 1; none without a gyroscope."""
+        names = self._table.names
+        return tuple(str(k + 1) if names is None else names[k] for k in self.columns.gyro or ())
+
+    def head(self) -> Float:
+        """Return the first rows, as `blocks` yields them, of the first block of PROBE or more."""
+        timed = self.columns.time is not None
+        width = (6 if self.columns.gyro else 3) + (self.columns.temperature is not None) + timed
+        return np.concatenate([np.empty((0, width)), *(rows.numbers[:, :width] for rows in self._head)])[
+            :HEAD
+        ]
 
     def close(self) -> None:
         """Release the file."""
@@ -169,6 +188,13 @@ class RawLog:
                 f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
                 "time that never decreases (--time none leaves it out)"
             )
+
+
+def _of_one(rows: Iterator[RowBlock], one: OneSensor) -> Iterator[RowBlock]:
+    """Yield rows, and refuse those of several sensors."""
+    for block in rows:
+        one.add(block)
+        yield block
 
 
 def _first(rows: Iterator[RowBlock], least: int) -> list[RowBlock]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -220,6 +220,8 @@ class Tiles:
         size: rows of a tile.
         gyro, timed, warm: whether the log has a gyroscope, time and temperature.
         rows: rows of the log, those left out included.
+        low, high: least and greatest reading of each axis, shape (3,), sensor units.
+        unusable: which tiles of a block are no readings, shape (B,); None for those of zeros alone.
         gaps: those of the time column.
     """
 
@@ -231,6 +233,8 @@ class Tiles:
         self.gaps = Gaps(longest)
         self.rows = 0
         self.warm_at = 6 + 6 * gyro
+        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+        self.unusable: Callable[[Float], Bool] = _are_zero
         self._store = RowStore(6 + 6 * gyro + warm + 2 * timed, IN_MEMORY)
         self._rest: Float | None = None
 
@@ -243,6 +247,9 @@ class Tiles:
         """Add the next rows, shape (B, k) as those of a RawLog; an `envelope` gets them, too."""
         block = np.ascontiguousarray(rows.T)  # (k, B): one column after the other
         self.rows += block.shape[1]
+        if block.shape[1]:
+            self.low = np.minimum(self.low, block[:3].min(axis=1))
+            self.high = np.maximum(self.high, block[:3].max(axis=1))
         if self._rest is not None and self._rest.shape[1]:
             need = self.size - self._rest.shape[1]
             self._rest = np.concatenate([self._rest, block[:, :need]], axis=1)
@@ -339,9 +346,22 @@ def windows(tiles: Tiles, width: int, step: int = 1) -> Iterator[Windows]:
             rate, turned = _window(block[:, 6:12], tiles.size, width, take)
             spread = turned.sum(axis=0)
         gaps = tiles.gaps.spanned(block[:, -2], block[:, -1], width) if tiles.timed else None
-        broken = np.zeros(variance.shape[1], dtype=bool) if gaps is None else gaps[start::step]
+        broken = _any_of(tiles.unusable(block), width)[start::step]
+        if gaps is not None:
+            broken |= gaps[start::step]
         norm = np.sqrt(variance[0] ** 2 + variance[1] ** 2 + variance[2] ** 2)
         yield Windows(first + start, mean.T, norm, rate.T, spread, broken)
+
+
+def _are_zero(block: Float) -> Bool:
+    """Return which tiles are zero in all axes and rows: an idle logger, not a sensor at rest."""
+    return np.asarray((block[:, :6] == 0).all(axis=1))
+
+
+def _any_of(tiles: Bool, width: int) -> Bool:
+    """Return which windows of `width` tiles have any of these, shape (B - width + 1,)."""
+    count = np.append(0, np.cumsum(tiles))
+    return np.asarray(count[width:] > count[:-width])
 
 
 def _window(moments: Float, size: int, width: int, take: slice) -> tuple[Float, Float]:

@@ -1,6 +1,7 @@
-"""ArduPilot corrects a reading in m/s^2, in the axes of the sensor, as (reading - ACCOFFS) * ACCSCAL, axis by axis.
+"""ArduPilot corrects a reading in m/s^2, in the axes of the log, as (reading - ACCOFFS) * ACCSCAL, axis by axis.
 
-It turns the board afterwards (AP_InertialSensor_Backend::_rotate_and_correct_accel). Its own calibration stores the
+It does so after the driver's own rotation, and turns the board afterwards
+(AP_InertialSensor_Backend::_rotate_and_correct_accel). Its own calibration stores the
 same sign: AccelCalibrator fits diag * (reading + offset) and saves minus its offset.
 """
 
@@ -10,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
+from accelcal_cli.exporters.base import EXPORTERS, INSTANCE
+from accelcal_cli.exporters.diagonal import DiagonalExporter
 from accelcal_cli.schema import setting
 from accelcal_cli.sensor.poses import AXES
 
@@ -26,8 +27,10 @@ LARGEST_OFFSET, SCALES = 3.5, (0.8, 1.2)
 class ArduPilot(DiagonalExporter):
     """ArduPilot parameters, in the file format of Mission Planner and MAVProxy.
 
-    INS_ACCOFFS_X, ..., INS_ACCSCAL_X, ...: offset D_a in m/s^2, scale 1 / K_ii.
+    INS_ACCOFFS_X, ..., INS_ACCSCAL_X, ...: offset D_a in m/s^2, scale of the sensor's own axis.
     """
+
+    orientation = "AHRS_ORIENTATION"
 
     suffix = ".param"
 
@@ -35,23 +38,24 @@ class ArduPilot(DiagonalExporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
-        offset, scale = self._parameters(result)
+        offset, triad = self.triad(result)
         header = [
             *base.origin(result),
-            "ArduPilot: corrected = (reading - ACCOFFS) * ACCSCAL, m/s^2, in the axes of the sensor.",
-            *(f"Warning: {warning}." for warning in self.warnings(result)),
+            "ArduPilot: corrected = (reading - ACCOFFS) * ACCSCAL, m/s^2, in the axes of the log.",
+            *self.notes(result),
         ]
         number = "" if self.instance == 0 else str(self.instance + 1)
         lines = "".join(
             f"INS_ACC{number}{key}_{axis.upper()},{value:.9g}\n"
-            for key, values in (("OFFS", offset), ("SCAL", scale))
+            for key, values in (("OFFS", offset), ("SCAL", triad.scale))
             for axis, value in zip(AXES, values, strict=True)
         )
         return (base.comment(header) + lines).encode()
 
     def warnings(self, result: Calibration) -> tuple[str, ...]:
         """Return what is left out, and whether ArduPilot would refuse the parameters."""
-        offset, scale = self._parameters(result)
+        offset, triad = self.triad(result)
+        scale = triad.scale
         usual = (
             np.abs(offset).max() <= LARGEST_OFFSET and SCALES[0] <= scale.min() <= scale.max() <= SCALES[1]
         )
@@ -60,8 +64,3 @@ class ArduPilot(DiagonalExporter):
             f"scales of {SCALES[0]:g} to {SCALES[1]:g}"
         )
         return (*super().warnings(result), *(() if usual else (refused,)))
-
-    def _parameters(self, result: Calibration) -> tuple[Float, Float]:
-        """Return offset, m/s^2, and scale, shape (3,) each."""
-        model = self.in_metres(result)
-        return model.D, 1.0 / np.diagonal(model.K)

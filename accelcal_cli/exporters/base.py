@@ -18,8 +18,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
 from accelcal_cli.schema import Checked, setting
-from accelcal_cli.sensor.model import MRAD, OUTPUT_OF_1_G, STANDARD_GRAVITY, ErrorModel
-from accelcal_cli.sensor.poses import AXES
+from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY, ErrorModel, sensitivity
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -98,7 +97,7 @@ class DriverExporter(Exporter):
                 scale that is not that of these readings.
         """
         metres = metres_per_unit(result)
-        scale = np.diagonal(result.K_a) / metres
+        scale = sensitivity(result.K_a) / metres
         if self.driver_scale is not None:
             near = scale / self.driver_scale
             if not (NEAR_ONE[0] < near.min() and near.max() < NEAR_ONE[1]):
@@ -115,24 +114,24 @@ class DriverExporter(Exporter):
         return ErrorModel(result.K_a, result.D_a * metres)
 
 
-@dataclass(frozen=True)
-class DiagonalExporter(DriverExporter):
-    """Base of the formats of targets that correct axis by axis and know no misalignments."""
+def is_mounted(result: Calibration) -> bool:
+    """Whether the result knows how the sensor lies in the body: its attitudes were known."""
+    return result.settings.get("attitudes") == "known"
 
-    def warnings(self, result: Calibration) -> tuple[str, ...]:
-        """Return the misalignments that are left out, in mrad and as force at 1 g, and what all formats leave out."""
-        further = super().warnings(result)
-        if result.held.any():
-            return further
-        rest = result.K_a / np.diagonal(result.K_a)[:, None] - np.eye(3)
-        i, j = np.unravel_index(int(np.abs(rest).argmax()), (3, 3))
-        angle = abs(float(rest[i, j]))
-        error = result.g * metres_per_unit(result) * float(np.linalg.norm(rest, 2))
-        return (
-            f"this format has no misalignments: up to {angle * MRAD:.3g} mrad ({angle:.3f} rad, axis {AXES[i]} towards "
-            f"{AXES[j]}) are dropped, an error of up to {error:.2g} m/s^2 at 1 g",
-            *further,
-        )
+
+BODY = {
+    "lower": "x along the x sensor axis, y in the plane of the x and y sensor axes (gauge lower)",
+    "upper": "z along the z sensor axis, y in the plane of the y and z sensor axes (gauge upper)",
+    "symmetric": "as near as can be to the three sensor axes (gauge symmetric)",
+    "full": "wherever the search ended (gauge full without known attitudes): only the length of the force counts",
+}
+"""Where the axes of the calibrated force lie, by gauge."""
+
+
+def frame(result: Calibration) -> str:
+    """Return a sentence that says which axes the force has that a whole matrix makes."""
+    axes = "those of the reference fx, fy, fz" if is_mounted(result) else BODY[result.gauge]
+    return f"Axes of the force: {axes}."
 
 
 def origin(result: Calibration) -> list[str]:
@@ -158,7 +157,7 @@ def rows(matrix: Float) -> list[list[float]]:
 
 def is_force(result: Calibration) -> bool:
     """Return whether the readings are specific force already, in the unit of the result."""
-    scale = np.diagonal(result.K_a)
+    scale = sensitivity(result.K_a)
     return bool(NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1])
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.calibration.result import Calibration
 
 HEADER = """\
 #ifndef ACCELCAL_CALIBRATION_H
@@ -47,7 +50,7 @@ class CHeader(Exporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the header; a `*/` in the origin does not end its comment."""
-        lines = [line.replace("*/", "* /") for line in base.origin(result)]
+        lines = [line.replace("*/", "* /") for line in [*base.origin(result), base.frame(result)]]
         text = HEADER.format(
             origin=base.comment(lines, " *"),
             unit=result.unit,

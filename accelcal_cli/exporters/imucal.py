@@ -1,6 +1,7 @@
 """imucal corrects a reading as R_a^-1 K_a^-1 (acc - b_a) (FerrarisCalibrationInfo).
 
-Its K_a holds the scale factors alone, R_a the rest. The gyroscope is left as it is.
+Its K_a holds the lengths of the rows alone, R_a rows of length 1 (ferraris_calibration.py).
+The gyroscope is left as it is.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+from accelcal_cli.sensor.model import sensitivity
 
 FORMAT = "2.0.0"
 
@@ -22,15 +24,14 @@ FORMAT = "2.0.0"
 class Imucal(Exporter):
     """Calibration info of the Python package imucal.
 
-    A Ferraris calibration: K_a diagonal, R_a = K_a^-1 times the whole matrix, b_a the bias. In gauge `full` the axes
-    may lie anywhere in the body, and the length of a row is the scale factor.
+    A Ferraris calibration: K_a the sensitivity of each axis, R_a the directions of the axes in the body, b_a the bias.
     """
 
     suffix = ".json"
 
     def content(self, result: Calibration) -> bytes:
         """Return the record as JSON."""
-        scale = np.linalg.norm(result.K_a, axis=1) if result.gauge == "full" else np.diagonal(result.K_a)
+        scale = sensitivity(result.K_a)
         record = {
             "cal_type": "Ferraris",
             "_format_version": FORMAT,
@@ -38,7 +39,9 @@ class Imucal(Exporter):
             "gyr_unit": "deg/s",
             "from_acc_unit": result.unit if base.is_force(result) else "a.u.",
             "from_gyr_unit": "deg/s",
-            "comment": "; ".join([*base.origin(result), "gyroscope not calibrated: identity"]),
+            "comment": "; ".join(
+                [*base.origin(result), base.frame(result), "gyroscope not calibrated: identity"]
+            ),
             "K_a": base.rows(np.diag(scale)),
             "R_a": base.rows(result.K_a / scale[:, None]),
             "b_a": base.rows(result.D_a)[0],

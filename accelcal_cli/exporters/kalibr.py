@@ -7,10 +7,13 @@ estimates b anew in every run; the key is for other readers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, DriverExporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 UNKNOWN = """\
   # PLACEHOLDERS: a static calibration does not know them. Take them from the data sheet or an Allan deviation.
@@ -38,7 +41,8 @@ class Kalibr(DriverExporter):
             model, unit = result.model.in_gauge("lower"), "unit of the readings"
         header = [
             *base.origin(result),
-            f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular (gauge lower).",
+            f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular.",
+            f"Axes of a: {base.BODY['lower']}, whatever the gauge of the result.",
         ]
         matrix = "".join(f"    - {row}\n" for row in base.rows(model.K))
         text = (

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 
 @EXPORTERS.register("numpy")
@@ -25,6 +26,8 @@ class NumPy(Exporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the arrays; `numpy.load` reads them."""
+        import numpy as np
+
         file = io.BytesIO()
         np.savez(
             file,
@@ -35,6 +38,6 @@ class NumPy(Exporter):
             covariance=result.covariance,
             g=np.array(result.g),
             unit=np.array(result.unit),
-            origin=np.array("; ".join(base.origin(result))),
+            origin=np.array("; ".join([*base.origin(result), base.frame(result)])),
         )
         return file.getvalue()

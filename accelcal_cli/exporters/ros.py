@@ -6,10 +6,13 @@ SM is K_A, row by row, and bias is f_0, in m/s^2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 
 @EXPORTERS.register("ros")
@@ -28,6 +31,7 @@ class Ros(Exporter):
         header = [
             *base.origin(result),
             "imu_calib: corrected = SM * reading - bias, m/s^2; the reading is in the unit of the calibrated readings.",
+            base.frame(result),
         ]
         matrix = [value for row in base.rows(result.model.K_A * metres) for value in row]
         bias = base.rows(result.model.f_0 * metres)[0]

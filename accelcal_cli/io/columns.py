@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
-from accelcal_cli.io.reader import InputTable, Selection
+from accelcal_cli.io.reader import InputTable, RowBlock, Selection
 from accelcal_cli.io.roles import Roles, Triple, bare_name, listed, recognise
 from accelcal_cli.io.vocabulary import FORCE_UNITS, describe, name_unit, parse_unit
 
@@ -53,6 +53,7 @@ class Columns:
     Attributes:
         output: x, y, z; names: of these, or their numbers from 1.
         sensor, label: which sensor and which pose a row is of.
+        identity: columns whose values tell sensors apart, where no `sensor` is stated.
         count, scatter: raw readings behind a row, and the standard deviation of one of them.
         reference: known specific force; temperature, time, gyro: as their names say.
         unit: of the output as the file states it: g, mg, m/s^2 or counts.
@@ -70,6 +71,7 @@ class Columns:
     time: int | None = None
     gyro: Triple | None = None
     unit: str | None = None
+    identity: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -85,13 +87,31 @@ class Columns:
     def selection(self) -> Selection:
         """Return what to ask of the table; a standard deviation or temperature may be missing in a row."""
         gaps = frozenset((*(self.scatter or ()), *_present(self.temperature)))
-        return Selection((*self.output, *self.extras), gaps, _present(self.sensor, self.label), self.output)
+        texts = (*_present(self.sensor, self.label), *self.identity)
+        return Selection((*self.output, *self.extras), gaps, texts, self.output)
 
     def split(self, extras: Float) -> tuple[Float | None, Float | None, Float]:
         """Split the values of `extras`, shape (B, k), into count (B,), scatter (B, 3) and the others (B, m)."""
         at = 0 if self.count is None else 1
         then = at + (0 if self.scatter is None else 3)
         return extras[:, 0] if at else None, extras[:, at:then] if then > at else None, extras[:, then:]
+
+    def check(self, table: InputTable, rows: RowBlock) -> None:
+        """Refuse counts that are not whole numbers of 1 or more, and standard deviations below zero."""
+        for at, column in enumerate(self.extras, 3):
+            counts, values = column == self.count, rows.numbers[:, at]
+            bad = are_no_counts(values) if counts else values < 0
+            if (counts or column in (self.scatter or ())) and bad.any():
+                expected = "count of 1 or more" if counts else "standard deviation of 0 or more"
+                where = table.where(rows.start + int(np.argmax(bad)))
+                raise DataError(
+                    f'{table.name}, {where}, column "{(table.names or ())[column]}": a {expected} was expected'
+                )
+
+
+def are_no_counts(count: Float) -> Bool:
+    """Return which numbers are not whole ones of 1 or more, same shape."""
+    return np.asarray((count < 1) | (count != np.round(count)))
 
 
 @dataclass(frozen=True)
@@ -102,6 +122,7 @@ class RawColumns:
         output: the accelerometer; names: of its columns, or their numbers from 1.
         gyro, time, temperature: None where there are none.
         unit: of the output as the file states it: g, mg, m/s^2 or counts.
+        identity: columns whose values tell sensors apart.
         dated: `time` holds dates, not numbers.
         guessed: `time` is only time when it never decreases.
         doubtful: the error when a guessed time column is not time, so that the others are unknown, too.
@@ -117,14 +138,15 @@ class RawColumns:
     dated: bool = False
     guessed: bool = False
     doubtful: str = ""
+    identity: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
     def selection(self) -> Selection:
-        """Return what to ask of the table: acceleration, gyroscope, temperature, time; dates as text."""
+        """Return what to ask of the table: acceleration, gyroscope, temperature, time; dates and identity as text."""
         warm = _present(self.temperature)
         sensors, time = (*self.output, *(self.gyro or ()), *warm), _present(self.time)
         texts, numbers = (time, sensors) if self.dated else ((), (*sensors, *time))
-        return Selection(numbers, frozenset(warm), texts, self.output, frozenset(warm))
+        return Selection(numbers, frozenset(warm), (*texts, *self.identity), self.output, frozenset(warm))
 
 
 def choose(
@@ -254,7 +276,7 @@ def _is_gravity(table: InputTable, triple: Triple) -> bool:
     """Return whether three columns are of constant length wherever they are still, in several directions."""
     if not all(table.numeric[k] for k in triple):
         return False
-    rows = np.array([[_value(cells[k]) for k in triple] for cells in table.preview()])
+    rows = np.array([[_value(cells[k]) for k in triple] for cells in table.preview()]).reshape(-1, 3)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if len(rows) < FEWEST_ROWS:
         return False
@@ -305,6 +327,27 @@ def _is_text(table: InputTable, clock: int) -> bool:
         return True
     first = next((cells[clock] for cells in table.preview() if cells[clock]), "")
     return first.isascii() and first.isdigit() and len(first) >= COUNTED
+
+
+def restrict(table: InputTable, where: Sequence[str]) -> None:
+    """Let only those rows of a table be read that meet conditions, each as COLUMN=VALUE.
+
+    Raises:
+        UsageError: no condition, or no such column.
+    """
+    if not where:
+        return
+    from accelcal_cli.io.rows import Condition, RowFilter  # which itself knows columns
+
+    conditions = []
+    for text in where:
+        word, equals, value = text.partition("=")
+        if not (equals and word.strip() and value.strip()):
+            raise UsageError(f'--where "{text}": expected COLUMN=VALUE, as in device=0')
+        column = find_column(table, word.strip(), "--where")
+        name = str(column + 1) if table.names is None else table.names[column]
+        conditions.append(Condition(column, name, value.strip()))
+    table.keep_only(RowFilter(table.name, conditions))
 
 
 def sensor_column(table: InputTable, wanted: str | None = None) -> int:
@@ -392,6 +435,8 @@ def _left(table: InputTable, roles: Roles, sensor: int | None) -> list[int]:
         *(roles.gyro or ()),
         *roles.alone["other"],
         *roles.alone["sensor"],
+        *roles.alone["instance"],
+        *roles.alone["kind"],
         sensor,
         *(roles.first(role) for role in ("count", "temperature", "label")),
         *(column for triple in roles.scatter.values() for column in triple),
@@ -453,6 +498,7 @@ def _with_extras(
         free("time"),
         free_triple(roles.gyro),
         unit_of_output(table, output),
+        () if sensor is not None else _identity(roles, taken),
     )
     if columns.unit is not None:
         notes = (*notes, f"the readings are in {columns.unit} by the file")
@@ -460,6 +506,17 @@ def _with_extras(
     if names is not None and used:
         notes = (*notes, f"column{'s' * (len(used) > 1)} {listed(names, used)} found")
     return replace(columns, notes=(*notes, *roles.partial))
+
+
+def is_kind(name: str) -> bool:
+    """Return whether a column, by its name, holds kinds: of sensors perhaps, or of poses."""
+    return bool(recognise((name,)).alone["kind"])
+
+
+def _identity(roles: Roles, taken: set[int | None]) -> tuple[int, ...]:
+    """Return the columns whose values tell sensors apart, as far as they are not otherwise used."""
+    columns = (column for role in ("sensor", "instance", "kind") for column in roles.alone[role])
+    return tuple(column for column in columns if column not in taken)
 
 
 def _by_name(table: InputTable, wanted: Sequence[str] | None) -> RawColumns:
@@ -474,6 +531,7 @@ def _by_name(table: InputTable, wanted: Sequence[str] | None) -> RawColumns:
             columns.time,
             columns.temperature,
             columns.unit,
+            identity=columns.identity,
             notes=tuple(kept),
         )
     guess = 0 if 0 not in columns.output and table.numeric[0] else None

@@ -29,6 +29,10 @@ BOM = b"\xef\xbb\xbf"
 
 _QUOTED = re.compile(r'"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+
+FEWEST_THOUSANDS = 6
+"""Cells such as 33,368 from which on they are thousands, where none says that the comma is a decimal mark."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +123,13 @@ def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:
         names = names or LAYOUTS.get((facts.device, len(first)))
     elif len(first) != len(names) or not first[-1]:
         names = tuple(_without_tail(list(names)))
+    rows_of_data = texts[layout.first :]
+    decimal_comma = _decimal_comma(rows_of_data, separator)
+    if decimal_comma:
+        _refuse_thousands(rows_of_data, separator, source)
     return Dialect(
         separator,
-        _decimal_comma(texts[layout.first :], separator),
+        decimal_comma,
         names,
         header,
         tuple(first),
@@ -241,6 +249,23 @@ def _decimal_comma(lines: list[str], separator: str) -> bool:
         for cell in row
     )
     return next((comma for comma, point in commas if comma or point), False)
+
+
+def _refuse_thousands(lines: list[str], separator: str, source: str) -> None:
+    """Raise DataError where commas separate thousands, as in 33,368, which a decimal comma would read as 33.368.
+
+    Fractions of three digits are told from thousands by cells such as 0,012: no number with thousands begins so.
+    """
+    cells = [cell for line in lines for cell in split_cells(line, separator) if "," in cell]
+    numbers = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
+    if len(numbers) < FEWEST_THOUSANDS or not all(_THOUSANDS.fullmatch(cell) for cell in numbers):
+        return
+    shown = numbers[0]
+    raise DataError(
+        f'{source}: "{shown}" has a thousands separator, it seems, as have all numbers with a comma: a decimal comma '
+        f"would make it {shown.replace(',', '.', 1)}; save the table without thousands separators "
+        f"({shown.replace(',', '')}), or, if the comma is a decimal mark, with decimal points"
+    )
 
 
 def _header_cells(line: str, separator: str) -> list[str]:

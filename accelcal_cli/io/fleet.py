@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,18 +17,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.io.columns import Columns, choose, own_sensor_column, sensor_column
+from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
-from accelcal_cli.io.readings import (
-    LOOKED_AT,
-    InputForm,
-    LabelledMeans,
-    Readings,
-    check_rows,
-    doubts,
-    log_warnings,
-    number_labels,
-)
+from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
+from accelcal_cli.io.rows import ZeroRows, add_stretches, places, zero_rows
+from accelcal_cli.io.screening import LOOKED_AT, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
 from accelcal_cli.notices import Notice
 
@@ -69,6 +63,11 @@ class TableOrigin:
     timed: bool
 
 
+EXTRAS: tuple[int | slice, ...] = (0, slice(1, 4), slice(4, 7))
+"""Where the store of what is known beside the output has the readings behind a pose, their standard deviations, and
+their covariances."""
+
+
 @dataclass(frozen=True, eq=False)
 class Batch:
     """The poses of R sensors as arrays of one length J; a sensor with fewer repeats its last pose.
@@ -77,7 +76,8 @@ class Batch:
         sensors: their numbers, shape (R,); count: poses of each, shape (R,).
         output: shape (R, J, 3), sensor units; pose: number of each pose among all, shape (R, J).
         behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
-        scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise.
+        scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise; cross: covariances xy, xz
+            and yz of one, shape (R, J, 3), sensor units squared, likewise.
     """
 
     sensors: Int
@@ -86,16 +86,7 @@ class Batch:
     pose: Int
     behind: Float | None = None
     scatter: Float | None = None
-
-    @property
-    def real(self) -> Bool:
-        """Which poses are no repetitions, shape (R, J)."""
-        return np.asarray(np.arange(self.output.shape[1]) < self.count[:, None])
-
-    def take(self, index: Int) -> Batch:
-        """Return the sensors at `index`."""
-        arrays = {part.name: getattr(self, part.name) for part in fields(self)}
-        return replace(self, **{name: array[index] for name, array in arrays.items() if array is not None})
+    cross: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +97,7 @@ class FleetReadings:
         source: the file, or how many.
         sensors: their labels, in the order in which they came; poses: J of each, shape (R,).
         origins: the tables, in their order.
+        zeros: rows that were zero in all axes and were left out, by number of the sensor: how many, and which.
     """
 
     source: str
@@ -114,6 +106,7 @@ class FleetReadings:
     origins: tuple[TableOrigin, ...]
     _store: RowStore = field(repr=False)  # number of the sensor, output
     _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
+    zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     @property
     def unit(self) -> str | None:
@@ -139,21 +132,45 @@ class FleetReadings:
             source=f'{origin.name}, sensor "{name}"',
             count=_known(batch.behind, at, count),
             scatter=_known(batch.scatter, at, count),
+            cross=_known(batch.cross, at, count),
+            warnings=self.warnings(batch, at),
         ).known_as(
             origin.sha256,
             origin.columns,
             origin.notes,
             lambda pose: self.where(int(poses[pose])),
-            self.warnings(batch, at),
-            origin.form,
+            form=origin.form,
         )
 
     def warnings(self, batch: Batch, at: int) -> tuple[Notice, ...]:
         """Return why the readings of the sensor at `at` in a batch may not be poses."""
-        origin, output = self.origin(int(batch.pose[at, 0])), batch.output[at, : batch.count[at]]
-        first, span = output[:LOOKED_AT], float(np.ptp(output, axis=0).max())
-        log = log_warnings(len(output), first, span, origin.name, timed=origin.timed) if origin.rows else ()
-        return (*log, *doubts(first, origin.columns))
+        count, poses, sensor = int(batch.count[at]), batch.pose[at], int(batch.sensors[at])
+        origin, first = self.origin(int(poses[0])), min(count, LOOKED_AT)
+        screened = Screened(
+            batch.output[at, :first],
+            origin.columns,
+            count,
+            lambda pose: self.where(int(poses[pose])),
+            origin.name,
+            single=origin.rows,
+            timed=origin.timed,
+            count=_known(batch.behind, at, first),
+            scatter=_known(batch.scatter, at, first),
+        )
+        return (*screened.notices(), *zero_rows(*self.zeros.get(sensor, (0, "")), count))
+
+    def doubtful(self, batch: Batch) -> Bool:
+        """Return which sensors of a batch may have warnings, shape (R,)."""
+        doubtful = needs_look(batch.output[:, :LOOKED_AT], batch.count)
+        if batch.scatter is not None:
+            doubtful |= (batch.scatter == 0).any(axis=(1, 2))
+        return np.asarray(doubtful | np.isin(batch.sensors, list(self.zeros)))
+
+    def labelled(self, batch: Batch) -> Bool:
+        """Return which sensors of a batch have poses that a label made, shape (R,)."""
+        if len({origin.rows for origin in self.origins}) == 1:
+            return np.full(len(batch.sensors), not self.origins[0].rows)
+        return np.array([not self.origin(pose).rows for pose in batch.pose[:, 0].tolist()])
 
     def batches(self) -> Iterator[Batch]:
         """Yield every sensor once, in batches of about equally many poses."""
@@ -176,13 +193,13 @@ class FleetReadings:
             index = by_count[group]
             steps = np.minimum(np.arange(int(counts[index].max())), counts[index, None] - 1)
             at = order[starts[index, None] + steps]
+            count, output = counts[index], rows[at, 1:]
             yield Batch(
                 first + index,
-                counts[index],
-                rows[at, 1:],
+                count,
+                output,
                 pose[at],
-                None if extras is None else extras[at, 0],
-                None if extras is None else extras[at, 1:],
+                *(None if extras is None else extras[at][..., part] for part in EXTRAS),
             )
 
     def _select(self, first: int, last: int) -> tuple[Float, Int]:
@@ -236,10 +253,12 @@ def read_fleet(
     """Read the static readings of many sensors; ``-`` is standard input.
 
     One table has a column that labels the sensor, found by its name or named by `sensor`. Of several files each is
-    one sensor, named by its file, unless `sensor` names that column. `columns` are the three output columns.
+    one sensor, named by its file, unless `sensor` names that column. `columns` are the three output columns. Of the
+    rows only those are read that meet the conditions `where`, each as COLUMN=VALUE.
 
     Raises:
-        DataError: a fault of the input, with its place; UsageError: of `columns` or `sensor`, or a file twice.
+        DataError: a fault of the input, with its place.
+        UsageError: a fault of `columns`, `sensor` or `where`, or a file twice.
     """
     for k, source in enumerate(sources):
         if source in sources[:k]:
@@ -250,6 +269,7 @@ def read_fleet(
     for source, name in zip(sources, names, strict=True):
         table = open_table(source, stdin, options=options)
         try:
+            restrict(table, options.where)
             collector.read(table, columns, sensor, name, options.count)
         finally:
             table.close()
@@ -260,7 +280,8 @@ def read_fleet(
             "column labels the sensor)"
         )
     sensors, origins = tuple(collector.index), tuple(collector.origins)
-    return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras)
+    zeros = collector.zeros
+    return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras, zeros)
 
 
 def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
@@ -283,6 +304,7 @@ class _FleetCollector:
     store: RowStore = field(default_factory=lambda: RowStore(4))
     extras: RowStore | None = None
     origins: list[TableOrigin] = field(default_factory=list)
+    zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     def read(
         self,
@@ -300,29 +322,39 @@ class _FleetCollector:
             shown = columns.names[columns.output.index(column)]
             raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
         means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
-        rows_read = 0
+        zeros, idle, rows_read = ZeroRows(), dict[int, list[int]](), 0
         for rows in table.blocks(columns.selection()):
             if not len(rows.numbers):
                 continue
             rows_read += len(rows.numbers)
-            check_rows(table, columns, rows)
+            columns.check(table, rows)
             labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
             codes = number_labels(self.index, labels)
-            output, (count, scatter, _) = rows.numbers[:, :3], columns.split(rows.numbers[:, 3:])
+            keep = None if columns.reference is not None else zeros.keep(rows.numbers[:, :3], rows.start)
+            numbers, label = rows.numbers, rows.texts[columns.sensor is not None] if means is not None else ()
+            if keep is not None:
+                for row in np.flatnonzero(~keep).tolist():
+                    idle.setdefault(int(codes[row]), []).append(rows.start + row)
+                codes, numbers, label = codes[keep], numbers[keep], list(compress(label, keep.tolist()))
+            output, (count, scatter, _) = numbers[:, :3], columns.split(numbers[:, 3:])
+            if not len(output):
+                continue
             if means is None:
                 self._add(codes, output, count, scatter)
             else:
-                means.add(list(zip(codes.tolist(), rows.texts[-1], strict=True)), output, count, scatter)
+                means.add(list(zip(codes.tolist(), label, strict=True)), output, count, scatter)
         if means is not None:
             codes = np.array([code for code, _ in means.index], dtype=np.intp)
-            self._add(codes, means.mean, means.count(), means.scatter())
+            self._add(codes, means.mean, means.count(), means.scatter(), means.cross())
+        self._note_zeros(idle, table.where)
+        place = _past_zeros(table.where, zeros) if zeros.count else table.where
         self.origins.append(
             TableOrigin(
                 table.name,
                 table.sha256,
                 columns.names,
                 first,
-                table.where if means is None else _by_label([label for _, label in means.index]),
+                place if means is None else _by_label([label for _, label in means.index]),
                 (*table.notes, *columns.notes, *(() if columns.temperature is None else (COLD,))),
                 InputForm(table.source_format, rows_read, table.rows_skipped, None, columns.unit),
                 rows=means is None,
@@ -330,7 +362,25 @@ class _FleetCollector:
             )
         )
 
-    def _add(self, codes: Int, output: Float, behind: Float | None, scatter: Float | None) -> None:
+    def _note_zeros(self, idle: dict[int, list[int]], where: Callable[[int], str]) -> None:
+        """Note the rows of zeros of each sensor; one that has nothing else keeps them."""
+        for code, rows in idle.items():
+            before, shown = self.zeros.get(code, (0, ""))
+            stretches: list[tuple[int, int]] = []
+            add_stretches(stretches, np.array(rows))
+            self.zeros[code] = before + len(rows), shown or places(stretches, where)
+            if code >= len(self.poses) or not self.poses[code]:
+                self._add(np.full(len(rows), code), np.zeros((len(rows), 3)), None, None)
+                del self.zeros[code]
+
+    def _add(
+        self,
+        codes: Int,
+        output: Float,
+        behind: Float | None,
+        scatter: Float | None,
+        cross: Float | None = None,
+    ) -> None:
         """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""
         before = self.store.rows
         self.poses = np.pad(self.poses, (0, len(self.index) - len(self.poses)))
@@ -339,11 +389,11 @@ class _FleetCollector:
         if behind is None and scatter is None and self.extras is None:
             return
         if self.extras is None:
-            self.extras = RowStore(4)
-            self.extras.append(np.full((before, 4), np.nan))
-        rows = np.empty((len(codes), 4))
-        rows[:, 0] = np.nan if behind is None else behind
-        rows[:, 1:] = np.nan if scatter is None else scatter
+            self.extras = RowStore(7)
+            self.extras.append(np.full((before, 7), np.nan))
+        rows = np.empty((len(codes), 7))
+        for part, values in zip(EXTRAS, (behind, scatter, cross), strict=True):
+            rows[:, part] = np.nan if values is None else values
         self.extras.append(rows)
 
 
@@ -356,6 +406,10 @@ def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> lis
             f'state --sensor-column "{shown}" to read every file that way'
         )
     return [name] * len(rows.numbers)
+
+
+def _past_zeros(where: Callable[[int], str], zeros: ZeroRows) -> Callable[[int], str]:
+    return lambda pose: where(zeros.rows.line(pose))
 
 
 def _by_label(labels: list[str]) -> Callable[[int], str]:

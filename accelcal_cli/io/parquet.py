@@ -16,6 +16,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.preamble import Facts
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
+from accelcal_cli.io.rows import RowFilter
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
 
 ROWS = 500_000
@@ -38,6 +39,7 @@ class ParquetTable:
     def __init__(self, source: ByteSource, path: Path | None) -> None:
         """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
         self.name = source.name
+        self.filter: RowFilter | None = None
         self._source = source
         self._hashing = BackgroundThread()
         self._files = ExitStack()
@@ -62,14 +64,20 @@ class ParquetTable:
         return self._source.sha256
 
     def preview(self) -> list[list[str]]:
-        """Return the cells of the first rows."""
+        """Return the cells of those of the first rows that are read."""
         with _named_errors(self.name):
             frame = pl.scan_parquet(self._path).head(PREVIEW).collect()
-        return [["" if cell is None else str(cell) for cell in row] for row in frame.iter_rows()]
+        rows = (["" if cell is None else str(cell) for cell in row] for row in frame.iter_rows())
+        return [cells for cells in rows if self.filter is None or self.filter.meets(cells)]
+
+    def keep_only(self, rows: RowFilter) -> None:
+        """Read only those rows."""
+        self.filter = rows
 
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns."""
-        wanted = dict.fromkeys(self.names[k] for k in (*selection.numbers, *selection.texts))
+        conditions = () if self.filter is None else (c.column for c in self.filter.conditions)
+        wanted = dict.fromkeys(self.names[k] for k in (*selection.numbers, *selection.texts, *conditions))
         return (rows for _, rows in self.pairs(selection, list(wanted)))
 
     def pairs(
@@ -79,8 +87,10 @@ class ParquetTable:
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
-        lazy, start = pl.scan_parquet(self._path).select(wanted or self.names), 0
-        while not (frame := self._batch(lazy, start)).is_empty():
+        lazy, start, read = pl.scan_parquet(self._path).select(wanted or self.names), 0, 0
+        while not (frame := self._batch(lazy, read)).is_empty():
+            read += frame.height
+            frame = frame if self.filter is None else self.filter.rows(frame)
             numbers = np.empty((frame.height, len(selection.numbers)))
             for k, column in enumerate(selection.numbers):
                 series = frame[self.names[column]].cast(pl.Float64).fill_null(float("nan"))
@@ -89,11 +99,16 @@ class ParquetTable:
             labels = tuple(self._labels(frame, start, column) for column in selection.texts)
             yield frame, RowBlock(start, numbers, labels)
             start += frame.height
+        if self.filter is not None:
+            self.filter.check()
 
     @property
     def where(self) -> Callable[[int], str]:
         """Row number, counted from 1."""
-        return _row
+        if self.filter is None:
+            return _row
+        lines = self.filter.lines
+        return lambda row: _row(lines.line(row + 1) - 1)
 
     def close(self) -> None:
         """Remove the copy and close the file."""
@@ -141,7 +156,7 @@ class ParquetTable:
         return [label or "" for label in labels]
 
     def _place(self, row: int, column: int) -> str:
-        return f'{self.name}, {_row(row)}, column "{self.names[column]}"'
+        return f'{self.name}, {self.where(row)}, column "{self.names[column]}"'
 
 
 def _row(row: int) -> str:

@@ -34,11 +34,13 @@ from accelcal_cli.io.dialect import (
 )
 from accelcal_cli.io.lines import LineFilter, find_filter
 from accelcal_cli.io.preamble import Facts
-from accelcal_cli.io.skipped import LineMap, PassedLines, name_lines
+from accelcal_cli.io.skipped import LineMap, PassedLines
 from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from accelcal_cli.io.rows import RowFilter
 
 LIMIT = 1e100
 """Largest reading: greater values cannot be squared safely."""
@@ -59,19 +61,21 @@ SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a user states about the form of a text.
+    """What a user states about the form of a table.
 
     Attributes:
         skip_rows: lines at its beginning that are not looked at.
         skip_bad: leave out rows that cannot be read, up to MOST_BAD of them.
         line: what the lines of readings begin with, among lines of several kinds; None to find them by their words.
         count: the column of counts, or ``none``; None to find it by its name.
+        where: conditions that the rows to read meet, each as COLUMN=VALUE.
     """
 
     skip_rows: int = 0
     skip_bad: bool = False
     line: str | None = None
     count: str | None = None
+    where: tuple[str, ...] = ()
 
 
 PLAIN = ReadOptions()
@@ -102,6 +106,9 @@ class RowBlock:
 
 class InputTable(Protocol):
     """A table that can be read once, from top to bottom."""
+
+    filter: RowFilter | None
+    """Which rows are read; all when None."""
 
     @property
     def name(self) -> str:
@@ -140,7 +147,10 @@ class InputTable(Protocol):
         """Rows left out as broken so far."""
 
     def preview(self) -> list[list[str]]:
-        """Return the cells of some of the first rows."""
+        """Return the cells of some of the first rows that are read."""
+
+    def keep_only(self, rows: RowFilter) -> None:
+        """Read only those rows."""
 
     @property
     def sha256(self) -> str:
@@ -184,14 +194,14 @@ class TextTable:
         """Find the dialect of `source` from its head."""
         self.name = source.name
         self._source, self._options = source, options
-        self._filter, self.dialect = _understand(source, options)
+        self._words, self.dialect = _understand(source, options)
         self.names, self.units, self.facts = self.dialect.names, self.dialect.units, self.dialect.facts
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
         self.has_rows = bool(self.dialect.first)
         self.passed = PassedLines()
+        self.filter: RowFilter | None = None
         self._lines = LineMap()
-        self._rows = 0
 
     @property
     def sha256(self) -> str:
@@ -201,7 +211,7 @@ class TextTable:
     @property
     def source_format(self) -> str:
         """How the text is written."""
-        form = "words" if self._filter else SEPARATORS[self.dialect.separator]
+        form = "words" if self._words else SEPARATORS[self.dialect.separator]
         return ", ".join(
             ["text", form, *(["decimal comma"] * self.dialect.decimal_comma), *self._source.forms]
         )
@@ -224,13 +234,13 @@ class TextTable:
                 (f"{above:,} line{plural} above the table skipped" if above else "comments")
                 + f": {facts}" * bool(facts)
             )
-        if self._filter is not None and (note := self._filter.note()):
+        if self._words is not None and (note := self._words.note()):
             notes.append(note)
         return (*notes, *self.passed.notes())
 
     def preview(self) -> list[list[str]]:
-        """Return the cells of some rows of the head, spread over it."""
-        head = self._source.head if self._filter is None else self._filter.translate(self._source.head)
+        """Return the cells of some rows of the head that are read, spread over it."""
+        head = self._source.head if self._words is None else self._words.translate(self._source.head)
         lines = head.splitlines()[self.dialect.top :]
         step = max(1, len(lines) // (2 * SAMPLE)) if len(lines) > 2 * SAMPLE else 1
         texts = [line.decode(errors="replace") for line in lines[::step]]
@@ -239,7 +249,15 @@ class TextTable:
             for text in texts
             if not is_comment(text, self.dialect.marks)
         )
-        return [cells for cells in rows if len(cells) >= self.dialect.width]
+        whole = (cells for cells in rows if len(cells) >= self.dialect.width)
+        return [cells for cells in whole if self.filter is None or self.filter.meets(cells)]
+
+    def keep_only(self, rows: RowFilter) -> None:
+        """Read only those rows, which may hold numbers where the first row of the table holds none."""
+        self.filter = rows
+        first = next(iter(self.preview()), None)
+        if first is not None:
+            self.numeric = tuple(looks_numeric(cell) for cell in first[: self.dialect.width])
 
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns; short inputs never import polars."""
@@ -247,22 +265,34 @@ class TextTable:
 
     def pairs(self, selection: Selection) -> Iterator[tuple[bytes, RowBlock]]:
         """Read blocks of whole lines, each with the selected columns of its rows."""
-        careful = CarefulParser(self.name, self.dialect, selection, lenient=self._options.skip_bad)
+        careful = CarefulParser(
+            self.name, self.dialect, selection, self.filter, lenient=self._options.skip_bad
+        )
         self._lines, self.passed = careful.lines, careful.passed
         parse = careful.parse if self._source.whole else FastParser(careful).parse
         for raw in self._source.blocks():
-            block = raw if self._filter is None else self._filter.translate(raw)
+            block = raw if self._words is None else self._words.translate(raw)
             top = _top(block, self.dialect.top) if careful.line == 0 else 0
-            if top:
-                yield block[:top], careful.parse(block[:top])
-            if top < len(block):
-                yield block[top:], parse(block[top:])
+            if top and (kept := self._kept(block[:top], top=self.dialect.top > 0)):
+                yield kept, careful.parse(kept)
+            if top < len(block) and (kept := self._kept(block[top:])):
+                yield kept, parse(kept)
+        if self.filter is not None:
+            self.filter.check()
         careful.check_passed()
+
+    def _kept(self, block: bytes, *, top: bool = False) -> bytes:
+        if self.filter is None:
+            return block
+        return self.filter.keep_all(block) if top else self.filter.keep(block, self.dialect)
 
     @property
     def where(self) -> Callable[[int], str]:
         """Line of a row that has been read."""
-        return self._lines.where
+        if self.filter is None:
+            return self._lines.where
+        lines, kept = self._lines, self.filter.lines
+        return lambda row: f"line {kept.line(lines.line(row))}"
 
     def close(self) -> None:
         """Release the file."""
@@ -308,12 +338,17 @@ class CarefulParser:
     source: str  # named in messages
     dialect: Dialect
     selection: Selection
+    filter: RowFilter | None = None  # that the lines have passed
     lines: LineMap = field(default_factory=LineMap)
     row: int = 0  # rows so far
     line: int = 0  # lines so far
     lenient: bool = False  # leave out broken rows
     passed: PassedLines = field(default_factory=PassedLines)
     last: dict[int, float] = field(default_factory=dict)  # values of the columns that are carried on
+
+    def __post_init__(self) -> None:
+        """Let lines that are no rows be named by their numbers in the input."""
+        self.passed.kept = None if self.filter is None else self.filter.lines
 
     def parse(self, block: bytes) -> RowBlock:
         """Return the rows of a block of whole lines; the first wrong cell raises DataError."""
@@ -345,12 +380,12 @@ class CarefulParser:
         if bad > MOST_BAD * (bad + self.row):
             raise DataError(
                 f"{self.source}: {bad:,} of {bad + self.row:,} rows are broken, more than the {MOST_BAD:.0%} that "
-                f"--skip-bad leaves out: {name_lines(self.passed.bad)}"
+                f"--skip-bad leaves out: {self.passed.named(self.passed.bad)}"
             )
 
     def _parts(self, raw: bytes) -> tuple[list[float], list[str]] | None:
         """Return numbers and texts of a line, None for one that is no row."""
-        line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self.line, self.source)
+        line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self._line(), self.source)
         if is_blank(line) or is_comment(line, self.dialect.marks):
             return None
         cells = self._cells(line)
@@ -393,6 +428,10 @@ class CarefulParser:
         self.line += rows
         return start
 
+    def _line(self) -> int:
+        """Return the number of the line in the input."""
+        return self.line if self.filter is None else self.filter.lines.line(self.line)
+
     def _cells(self, line: str) -> list[str]:
         if line.count('"') % 2:
             raise DataError(f"{self._place()}: a quotation mark is not closed on its line")
@@ -423,7 +462,7 @@ class CarefulParser:
 
     def _place(self, column: int | None = None) -> str:
         """Return where the parser is, for a message."""
-        here, names = f"{self.source}, line {self.line}", self.dialect.names
+        here, names = f"{self.source}, line {self._line()}", self.dialect.names
         if column is None:
             return here
         name = f'"{names[column]}"' if names is not None and names[column] else column + 1

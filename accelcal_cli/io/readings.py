@@ -2,13 +2,12 @@
 
 `read_readings` gathers the rows of a table into poses: one per row, or one per label, averaged as the rows stream by
 (`LabelledMeans`). The outputs stay in a store that may be on disk; a calibration takes them in blocks. Before anything
-is fitted, `log_warnings` and `doubts` say what makes them doubtful: logs, dead or duplicate axes, copied rows.
+is fitted, they are screened (screening.py).
 """
 
 from __future__ import annotations
 
 import hashlib
-import shlex
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,35 +16,20 @@ from typing import BinaryIO, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import LIMIT, PLAIN, InputTable, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.columns import Columns, are_no_counts, choose, restrict
+from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.rows import OneSensor, ZeroRows
+from accelcal_cli.io.screening import LOOKED_AT, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
-from accelcal_cli.notices import COMMAND, Notice
+from accelcal_cli.notices import Notice
 
 STUCK = 1_000_000
 """Equal readings in a row after which an input is not read on."""
 
 MOST_LABELS = 1_000_000
 """Different labels of poses at most: their means are kept in memory."""
-
-RAW_ROWS = 500
-"""From so many rows on, rows with a time each, or each much like the one before, are a raw log rather than poses."""
-
-ALIKE, LOOKED_AT = 0.05, 4096
-"""Poses differ from one to the next; most of the first LOOKED_AT rows of a log differ by less than this part of the
-range."""
-
-MANY_COPIES = 1 / 3
-"""Part of the poses from which on copies are reported. One row that occurs twice does no harm, and readings without
-noise repeat where an attitude does."""
-
-LIVE = "Name the columns of three living axes (--columns), and turn the sensor about all of them."
-"""What to do about a dead axis."""
-
-PAIRS = ((0, 1), (0, 2), (1, 2))
-"""Pairs of axes."""
 
 Label = TypeVar("Label", bound=Hashable)
 
@@ -79,6 +63,7 @@ class Readings:
         labels: of the poses; None where each row is a pose.
         count: raw readings behind each pose, shape (J,).
         scatter: standard deviation of one raw reading, shape (J, 3), sensor units, NaN if unknown.
+        cross: covariances xy, xz and yz of one raw reading, shape (J, 3), sensor units squared, NaN if unknown.
         reference: known specific force, shape (J, 3), m/s^2 or g as given.
         temperature: shape (J,), as given, NaN where missing.
         notes: what the reader did that a user should know.
@@ -95,6 +80,7 @@ class Readings:
     labels: tuple[str, ...] | None = None
     count: Float | None = None
     scatter: Float | None = None
+    cross: Float | None = None
     reference: Float | None = None
     temperature: Float | None = None
     notes: tuple[str, ...] = ()
@@ -125,10 +111,14 @@ class Readings:
         labels: Sequence[str] | None = None,
         count: ArrayLike | None = None,
         scatter: ArrayLike | None = None,
+        cross: ArrayLike | None = None,
         reference: ArrayLike | None = None,
         temperature: ArrayLike | None = None,
+        warnings: tuple[Notice, ...] | None = None,
     ) -> Readings:
         """Return readings from memory: output (J, 3) in sensor units, the rest as in the fields.
+
+        They are screened unless `warnings` are stated.
 
         Raises:
             DataError: an array of another shape, or values that no readings have.
@@ -138,19 +128,25 @@ class Readings:
         if labels is not None and not len(set(map(str, labels))) == len(labels) == poses:
             raise DataError(f"labels: {poses} different labels were expected, one per pose")
         numbers = None if count is None else _array("count", count, 1, poses)[:, 0]
-        if numbers is not None and _are_no_counts(numbers).any():
+        if numbers is not None and are_no_counts(numbers).any():
             raise DataError("count: whole numbers of 1 or more were expected")
-        collector = Collector(source, Columns((0, 1, 2), ("1", "2", "3")))
+        spread = None if scatter is None else _array("scatter", scatter, 3, poses, gaps=True)
+        warm = None if temperature is None else _array("temperature", temperature, 1, poses, gaps=True)[:, 0]
+        collector = Collector(source, Columns((0, 1, 2), ("1", "2", "3")), zeros=reference is not None)
         collector.add(RowBlock(0, rows))
+        # Rows of zeros may have been left out.
+        kept = slice(None) if not collector.zeros.count else rows.any(axis=1)
+        numbers = None if numbers is None else numbers[kept]
+        spread = None if spread is None else spread[kept]
+        sha256 = hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest()
         return replace(
-            collector.readings(hashlib.sha256(rows.astype("<f8").tobytes()).hexdigest()),
-            labels=None if labels is None else tuple(map(str, labels)),
+            collector.readings(sha256, known=(numbers, spread), warm=warm is not None, warnings=warnings),
+            labels=None if labels is None else tuple(np.array(labels, dtype=str)[kept].tolist()),
             count=numbers,
-            scatter=None if scatter is None else _array("scatter", scatter, 3, poses, gaps=True),
+            scatter=spread,
+            cross=None if cross is None else _array("cross", cross, 3, poses, gaps=True)[kept],
             reference=None if reference is None else _array("reference", reference, 3, poses),
-            temperature=(
-                None if temperature is None else _array("temperature", temperature, 1, poses, gaps=True)[:, 0]
-            ),
+            temperature=None if warm is None else warm[kept],
         )
 
     def with_output(self, output: Float) -> Self:
@@ -190,16 +186,20 @@ def read_readings(
     """Read static readings from a text table or a Parquet file; ``-`` is standard input.
 
     `columns` names the three output columns, or numbers them from 1; without it their names decide. `options` say what
-    the user knows of the form of a text. Rows that share a position label are averaged.
+    the user knows of the form of a table, and which rows to read. Rows that share a position label are averaged.
 
     Raises:
-        DataError: a fault of the input, with its place. UsageError: a fault of `columns`.
+        DataError: a fault of the input, with its place, or readings of several sensors.
+        UsageError: a fault of `columns` or of the conditions `options.where`.
     """
     table = open_table(source, stdin, options=options)
     try:
+        restrict(table, options.where)
         collector = Collector(table.name, choose(table, columns, count=options.count))
+        one = OneSensor(table, collector.columns.identity, fleet=True)
         for rows in table.blocks(collector.columns.selection()):
-            check_rows(table, collector.columns, rows)
+            collector.columns.check(table, rows)
+            one.add(rows)
             collector.add(rows)
         collector.notes[:0] = table.notes
         form = InputForm(
@@ -210,25 +210,14 @@ def read_readings(
         table.close()
 
 
-def check_rows(table: InputTable, columns: Columns, rows: RowBlock) -> None:
-    """Refuse counts that are not whole numbers of 1 or more, and standard deviations below zero."""
-    for at, column in enumerate(columns.extras, 3):
-        counts, values = column == columns.count, rows.numbers[:, at]
-        bad = _are_no_counts(values) if counts else values < 0
-        if (counts or column in (columns.scatter or ())) and bad.any():
-            expected = "count of 1 or more" if counts else "standard deviation of 0 or more"
-            where = table.where(rows.start + int(np.argmax(bad)))
-            raise DataError(
-                f'{table.name}, {where}, column "{(table.names or ())[column]}": a {expected} was expected'
-            )
-
-
 class Collector:
     """Gathers blocks of rows into poses."""
 
-    def __init__(self, source: str, columns: Columns) -> None:
-        """Expect rows as `columns.selection()` asks for them."""
+    def __init__(self, source: str, columns: Columns, *, zeros: bool = False) -> None:
+        """Expect rows as `columns.selection()` asks for them; with `zeros` those that are all zero are readings."""
         self.source, self.columns = source, columns
+        self.zeros = ZeroRows()
+        self._all = zeros or columns.reference is not None
         self.notes = list(columns.notes)
         self.store = RowStore()
         self.rows = 0
@@ -239,7 +228,12 @@ class Collector:
 
     def add(self, rows: RowBlock) -> None:
         """Add one block."""
+        rows = rows if self._all else self.zeros.without(rows)
         if not len(rows.numbers):
+            if self.zeros.count >= STUCK and not self.rows:
+                raise DataError(
+                    f"{self.source}: the first {self.zeros.count:,} readings are all equal, (0, 0, 0)"
+                )
             return
         output, extras = rows.numbers[:, :3], rows.numbers[:, 3:]
         self.rows += len(output)
@@ -260,26 +254,35 @@ class Collector:
                 )
 
     def readings(
-        self, sha256: str, where: Callable[[int], str] | None = None, form: InputForm | None = None
+        self,
+        sha256: str,
+        where: Callable[[int], str] | None = None,
+        form: InputForm | None = None,
+        *,
+        known: tuple[Float | None, Float | None] = (None, None),
+        warm: bool = False,
+        warnings: tuple[Notice, ...] | None = None,
     ) -> Readings:
         """Return the poses of all rows; DataError where they are too few or all the same.
 
         Args:
             sha256: of the input; where: how to name a row (from 0) to the user; form: how the input is written.
+            known: readings behind each pose (J,) and their scatter (J, 3), where no column has them.
+            warm: whether temperatures are known, likewise.
+            warnings: what is said of them; None to screen them.
         """
         columns, means = self.columns, self._means
         extras: tuple[Float | None, Float | None, Float | None] = (None, None, None)
+        cross = None
         if means is not None:
-            extras = means.count(), means.scatter(), means.mean[:, 3:]
+            extras, cross = (means.count(), means.scatter(), means.mean[:, 3:]), means.cross()
             self._take_means(means)
         elif self._extras:
             extras = columns.split(np.concatenate(self._extras))
         count, scatter, others = extras
         self._check()
-        _, first = next(self.store.blocks(LOOKED_AT))
-        span, timed = float((self.upper - self.lower).max()), columns.time is not None
-        log = log_warnings(self.store.rows, first, span, self.source, timed=timed) if means is None else ()
-        return Readings(
+        line = where if where is None or not self.zeros.count else self._line_of(where)
+        readings = Readings(
             self.source,
             sha256,
             columns.names,
@@ -289,14 +292,43 @@ class Collector:
             None if means is None else tuple(means.index),
             count,
             scatter,
+            cross,
             reference=None if others is None or columns.reference is None else others[:, :3],
             temperature=None if others is None or columns.temperature is None else others[:, -1],
             notes=tuple(self.notes),
-            warnings=(*log, *doubts(first, columns.names)),
             form=InputForm(rows=self.rows) if form is None else form,
             _store=self.store,
-            _line=where,
+            _line=line,
         )
+        if warnings is None:
+            found = replace(
+                self._screened(readings, known), warm=warm or columns.temperature is not None
+            ).notices()
+            warnings = (*found, *self.zeros.notices(where or _pose, self.store.rows))
+        return replace(readings, warnings=warnings)
+
+    def _screened(self, readings: Readings, known: tuple[Float | None, Float | None]) -> Screened:
+        _, first = next(self.store.blocks(LOOKED_AT))
+        count, scatter = (
+            part if part is not None else other
+            for part, other in zip((readings.count, readings.scatter), known, strict=True)
+        )
+        return Screened(
+            np.asarray(first),
+            self.columns.names,
+            self.store.rows,
+            readings.where,
+            self.source,
+            single=self._means is None and count is None,
+            timed=self.columns.time is not None,
+            count=None if count is None else count[: len(first)],
+            scatter=None if scatter is None else scatter[: len(first)],
+        )
+
+    def _line_of(self, where: Callable[[int], str]) -> Callable[[int], str]:
+        """Return how to name a pose where rows of zeros have been left out."""
+        rows = self.zeros.rows
+        return lambda pose: where(rows.line(pose))
 
     def _take_means(self, means: LabelledMeans[str]) -> None:
         """Let the means of the labels be the poses."""
@@ -307,6 +339,11 @@ class Collector:
             self.notes.append(f"{self.rows:,} rows averaged into {len(means.rows):,} positions by label")
 
     def _check(self) -> None:
+        if self.zeros.count and not self.store.rows:
+            raise DataError(
+                f"{self.source}: all {self.zeros.count:,} readings are equal, (0, 0, 0); the sensor has to be turned "
+                "between them"
+            )
         if self.store.rows < 2:
             few = "only one pose" if self.store.rows else "no readings"
             if self.store.rows and self.columns.label is not None:
@@ -336,7 +373,8 @@ class LabelledMeans(Generic[Label]):
     Attributes:
         index: number of each label, in order of first occurrence.
         rows, weight: table rows and raw readings of each label, shape (J,).
-        mean: shape (J, width); square: weighted sum of squares about the mean, shape (J, 3).
+        mean: shape (J, width); square: weighted sum of squares about the mean, shape (J, 3); product: of products xy,
+            xz and yz, shape (J, 3).
         spread: standard deviation stated by the label's last row, shape (J, 3), sensor units.
     """
 
@@ -347,6 +385,7 @@ class LabelledMeans(Generic[Label]):
         self.index: dict[Label, int] = {}
         self.rows, self.weight = np.zeros(0), np.zeros(0)
         self.mean, self.square, self.spread = np.zeros((0, width)), np.zeros((0, 3)), np.zeros((0, 3))
+        self.product = np.zeros((0, 3))
         self.weighted = self.spreads = False
 
     def add(
@@ -375,6 +414,7 @@ class LabelledMeans(Generic[Label]):
         present = fresh > 0
         total = self.weight + fresh
         share = np.divide(fresh, total, out=np.zeros_like(total), where=present)
+        apart, steps = [], []
         for k in range(rows.shape[1]):
             mean = np.divide(
                 _sums(codes, weight * shifted[:, k], len(fresh)),
@@ -384,9 +424,14 @@ class LabelledMeans(Generic[Label]):
             )
             step = np.where(present, origin[k] + mean - self.mean[:, k], 0.0)
             if k < 3:
-                inner = _sums(codes, weight * (shifted[:, k] - mean[codes]) ** 2, len(fresh))
+                apart.append(shifted[:, k] - mean[codes])
+                steps.append(step)
+                inner = _sums(codes, weight * apart[k] ** 2, len(fresh))
                 self.square[:, k] += inner + step**2 * self.weight * share
             self.mean[:, k] += step * share
+        for p, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+            inner = _sums(codes, weight * apart[i] * apart[j], len(fresh))
+            self.product[:, p] += inner + steps[i] * steps[j] * self.weight * share
         self.weight = total
 
     def _grow(self, size: int) -> None:
@@ -395,9 +440,9 @@ class LabelledMeans(Generic[Label]):
         more = size - len(self.rows)
         if more:
             self.rows, self.weight = (np.append(old, np.zeros(more)) for old in (self.rows, self.weight))
-            self.mean, self.square, self.spread = (
+            self.mean, self.square, self.product, self.spread = (
                 np.vstack([old, np.zeros((more, old.shape[1]))])
-                for old in (self.mean, self.square, self.spread)
+                for old in (self.mean, self.square, self.product, self.spread)
             )
 
     @property
@@ -418,81 +463,28 @@ class LabelledMeans(Generic[Label]):
         pooled = np.sqrt(np.divide(self.square, freedom, out=np.zeros_like(self.square), where=freedom > 0))
         return np.where(self.rows[:, None] > 1, pooled, single)
 
+    def cross(self) -> Float | None:
+        """Return the covariances xy, xz and yz of one raw reading (J, 3), sensor units squared; NaN where unknown.
+
+        None where a row states standard deviations: those say nothing of how the axes go together.
+        """
+        if self.spreads or not self.repeated:
+            return None
+        freedom = self.rows[:, None] - 1
+        return np.divide(self.product, freedom, out=np.full_like(self.product, np.nan), where=freedom > 0)
+
 
 def number_labels(index: dict[Label, int], labels: Sequence[Label]) -> Int:
     """Return the number of each label, shape (B,), by the index, to which a new one is added with the next number."""
     return np.fromiter((index.setdefault(label, len(index)) for label in labels), np.intp, len(labels))
 
 
-def log_warnings(rows: int, first: Float, span: float, source: str, *, timed: bool) -> tuple[Notice, ...]:
-    """Return a warning for rows that are taken for poses and may be a log: timed, or each much like the one before.
-
-    Args:
-        rows: how many; first: the first of them, shape (B, 3), LOOKED_AT at most.
-        span: the largest range of an axis; source: of the rows, a path or a name in angle brackets.
-        timed: whether they have times.
-    """
-    if rows < RAW_ROWS or not (timed or np.median(np.abs(np.diff(first, axis=0)).max(axis=1)) < ALIKE * span):
-        return ()
-    text = (
-        f"Each row is taken for a pose at rest. If these {rows:,} rows are a log with moves in it, its static poses "
-        "have to be found first; of many readings of one pose, label the poses in a column."
-    )
-    place = {"<stdin>": "-", "<array>": "LOG"}.get(source, shlex.quote(source))
-    return (Notice("log", "warning", text, f"{COMMAND}calibrate {place} --raw"),)
-
-
-def doubts(output: Float, names: Sequence[str]) -> list[Notice]:
-    """Return what is doubtful about poses.
-
-    Args:
-        output: of the poses, or of many of them, shape (J, 3), sensor units.
-        names: of the three columns.
-    """
-    dead = [
-        f'Column "{name}" is {output[0, i]:g} in every pose: its axis is dead or was never turned.'
-        for i, name in enumerate(names)
-        if (output[:, i] == output[0, i]).all()
-    ]
-    dead += [
-        f'Columns "{names[i]}" and "{names[j]}" are equal in every pose: they show one axis.'
-        for i, j in PAIRS
-        if (output[:, i] == output[:, j]).all()
-    ]
-    notices = [Notice("dead-axis", "warning", text, LIVE) for text in dead]
-    copies = len(output) - len({row.tobytes() for row in output})
-    if copies >= MANY_COPIES * len(output):
-        text = (
-            f"{copies:,} of {len(output):,} poses repeat another to the last digit. Sigma counts them as independent "
-            "measurements."
-        )
-        notices.append(Notice("duplicate-rows", "warning", text, "Leave copies out."))
-    return notices
-
-
-def may_be_doubtful(output: Float, poses: Int) -> Bool:
-    """Return which of R sensors to ask `doubts` about, shape (R,): all of those of which it has something to say.
-
-    Args:
-        output: their poses, shape (R, J, 3), whatever follows the last; poses: of each, shape (R,).
-    """
-    real = np.arange(output.shape[1]) < poses[:, None]
-    dead = ((output == output[:, :1]) | ~real[..., None]).all(axis=1).any(axis=1)
-    axes = np.moveaxis(output, 2, 0)
-    equal = [((axes[i] == axes[j]) | ~real).all(axis=1) for i, j in PAIRS]
-    # Mixed into one number, rows that are equal stay equal; NaN comes last.
-    mixed = np.sort(np.where(real, axes[0] + np.pi * axes[1] + np.e * axes[2], np.nan), axis=1)
-    copies = (mixed[:, 1:] == mixed[:, :-1]).sum(axis=1)
-    many = copies >= MANY_COPIES * np.minimum(poses, LOOKED_AT)
-    return np.asarray(dead | np.logical_or.reduce(equal) | many)
-
-
 def _sums(codes: Int, values: Float, size: int) -> Float:
     return np.bincount(codes, weights=values, minlength=size).astype(np.float64, copy=False)
 
 
-def _are_no_counts(count: Float) -> Bool:
-    return np.asarray((count < 1) | (count != np.round(count)))
+def _pose(row: int) -> str:
+    return f"pose {row + 1}"
 
 
 def _array(what: str, values: ArrayLike, width: int, rows: int | None = None, *, gaps: bool = False) -> Float:

@@ -42,6 +42,8 @@ _ALONE = {
         r"(?:sensor|device|serial|imu|accelerometer|dut|node|board|chip|module|unit|part)"
         r"(?:id|no|nr|num|number|name|label|serial|serialno|serialnr|serialnumber|sn)|sensors?|device|serial|sn|imu|dut"
     ),
+    "instance": re.compile(r"(?:imu|sensor|acc|accel)?instance(?:id|no|nr|num|number)?"),
+    "kind": re.compile(r"(?:sensor|data|msg|message)?(?:type|kind)|topic|channel|measurement"),
     "other": re.compile(
         r"|t|time|timestamp|stamp|start|end|stop|tstart|tend|starttime|endtime|index|row|sec|seconds|id"
     ),
@@ -145,6 +147,8 @@ def _role(name: str, key: str) -> str | None:
     """Return the role of a single column, None for an axis and for an unknown name."""
     if _CAPITAL_T.fullmatch(name.strip()):
         return "temperature"
+    if name.strip() == "I":  # the instance, in the logs of ArduPilot
+        return "instance"
     role = next((role for role, pattern in _ALONE.items() if pattern.fullmatch(key)), None)
     if role is None and is_temperature(name):
         return "temperature"

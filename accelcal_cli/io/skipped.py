@@ -7,6 +7,10 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from accelcal_cli.arrays import Int
+
 NAMED = 8
 """Lines that a note names at most."""
 
@@ -23,6 +27,15 @@ class LineMap:
         if not self.rows or line - row != self.lines[-1] - self.rows[-1]:
             self.rows.append(row)
             self.lines.append(line)
+
+    def add_many(self, rows: Int, lines: Int) -> None:
+        """Note that each of some rows, ascending, is on its line."""
+        if not len(rows):
+            return
+        self.add(int(rows[0]), int(lines[0]))
+        breaks = np.flatnonzero(np.diff(lines - rows)) + 1
+        self.rows.frombytes(rows[breaks].astype(np.int64).tobytes())
+        self.lines.frombytes(lines[breaks].astype(np.int64).tobytes())
 
     def line(self, row: int) -> int:
         """Return the line number of a row."""
@@ -41,12 +54,14 @@ class PassedLines:
     Attributes:
         bad: numbers of broken lines; headers: of repeated headers; merged: how many lines are of other sensors.
         cut: number of the last line, if it was cut off.
+        kept: where the lines come from, if only some of the input were looked at; the numbers above count these.
     """
 
     bad: array[int] = field(default_factory=lambda: array("q"))
     headers: array[int] = field(default_factory=lambda: array("q"))
     merged: int = 0
     cut: int | None = None
+    kept: LineMap | None = None
 
     def lines(self) -> list[int]:
         """Return the numbers of lines that are broken, cut off, or headers again."""
@@ -58,19 +73,21 @@ class PassedLines:
         if self.bad:
             plural = "s" * (len(self.bad) != 1)
             notes.append(
-                f"{len(self.bad):,} broken row{plural} left out (--skip-bad): {name_lines(self.bad)}"
+                f"{len(self.bad):,} broken row{plural} left out (--skip-bad): {self.named(self.bad)}"
             )
         if self.cut is not None:
-            notes.append(f"the last line, {self.cut:,}, left out: it is cut off")
+            notes.append(f"the last line, {self._line(self.cut):,}, left out: it is cut off")
         if self.headers:
-            notes.append(f"the header is repeated and left out: {name_lines(self.headers)}")
+            notes.append(f"the header is repeated and left out: {self.named(self.headers)}")
         if self.merged:
             notes.append(f"{self.merged:,} rows left out: their cells of the readings are empty")
         return notes
 
+    def named(self, numbers: Sequence[int]) -> str:
+        """Return how a message names lines of the input: ``lines 5, 9 and 3 more``."""
+        shown = ", ".join(str(self._line(number)) for number in numbers[:NAMED])
+        more = f" and {len(numbers) - NAMED:,} more" if len(numbers) > NAMED else ""
+        return f"line{'s' * (len(numbers) != 1)} {shown}{more}"
 
-def name_lines(numbers: Sequence[int]) -> str:
-    """Return how a message names lines: ``lines 5, 9 and 3 more``."""
-    shown = ", ".join(str(number) for number in numbers[:NAMED])
-    more = f" and {len(numbers) - NAMED:,} more" if len(numbers) > NAMED else ""
-    return f"line{'s' * (len(numbers) != 1)} {shown}{more}"
+    def _line(self, number: int) -> int:
+        return number if self.kept is None else self.kept.line(number)

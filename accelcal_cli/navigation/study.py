@@ -49,7 +49,7 @@ class FilterEntry:
 
     def build(self) -> Filter:
         """Return the filter."""
-        return FILTERS.build(self.filter, self.parameters, self.name)
+        return from_mapping(FILTERS.get(self.filter), self.parameters, self.name)
 
     @property
     def name(self) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, S, Status, take
+from accelcal_cli.optimization.optimizer import Optimizer, S, Status, take
 from accelcal_cli.optimization.problem import Counted, Problem
 from accelcal_cli.rng import Streams
 
@@ -107,8 +107,9 @@ def minimize(
 
 def polish(problem: Problem, x: Float) -> Run:
     """Return Levenberg-Marquardt runs from points x, shape (R, D), inside the box of a problem with residuals."""
-    solver = OPTIMIZERS.get("levenberg-marquardt")()
-    return minimize(problem, solver, runs=len(x), start=x[:, None, :], trace=False)
+    from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
+
+    return minimize(problem, LevenbergMarquardt(), runs=len(x), start=x[:, None, :], trace=False)
 
 
 class _Loop(Generic[S]):

@@ -137,6 +137,14 @@ def optimizer_file(name: str) -> Path | None:
 
 
 def shipped_parameters(optimizer: object) -> dict[str, Any]:
-    """Return the settings that the file of an optimizer states; none for an unknown one."""
-    path = optimizer_file(optimizer) if isinstance(optimizer, str) else None
+    """Return the settings that an optimizer has when none are stated; none for an unknown one.
+
+    Those of an installed optimizer are in its file. Those of a built-in one are the defaults of its class, which its
+    file states with their source (the contract compares them): a run need not read it.
+    """
+    if not isinstance(optimizer, str) or (cls := OPTIMIZERS.find(optimizer)) is None:
+        return {}
+    if OPTIMIZERS.is_built_in(cls):
+        return {field.name: field.default for field in dataclasses.fields(cls)}
+    path = optimizer_file(optimizer)
     return dict(load_mapping(path).get("parameters") or {}) if path else {}

@@ -125,27 +125,40 @@ class ErrorModel:
         return ErrorModel(to_gauge(self.K, gauge), self.D)
 
 
+AXIS_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Pairs of sensor axes in the order of their misalignments: xy, xz, yz."""
+
+
+def sensitivity(K: Float) -> Float:
+    """Return the scale factor of each sensor axis, shape (..., 3), of K_a, shape (..., 3, 3), in any gauge.
+
+    Definition: the length of row i, the output of axis i for one unit of force along it. Units: as K_a.
+    """
+    return np.asarray(np.linalg.norm(K, axis=-1))
+
+
 def scale_error(K: Float, nominal: Float) -> Float:
-    """Return the scale-factor errors, shape (3,). Definition: (K_ii - nominal) / nominal. Units: 1."""
-    return np.asarray(np.diagonal(K) / nominal - 1.0)
+    """Return the scale-factor errors, shape (..., 3). Definition: sensitivity / nominal - 1. Units: 1."""
+    return np.asarray(sensitivity(K) / nominal - 1.0)
 
 
 def misalignment(K: Float) -> Float:
-    """Return the misalignment angles, shape (3, 3), zero diagonal.
+    """Return the misalignments xy, xz and yz, shape (..., 3), of K_a, shape (..., 3, 3), in any gauge.
 
-    Definition: K_ij / K_ii, for small angles the turn of sensor axis i towards body axis j. Units: rad.
+    Definition: the angle by which two sensor axes miss 90 degrees, the arc sine of the cosine between rows of K_a;
+    positive where the axes are closer. Units: rad.
     """
-    angles = K / np.diagonal(K)[:, None]
-    np.fill_diagonal(angles, 0.0)
-    return angles
+    rows = K / sensitivity(K)[..., None]
+    first, second = np.transpose(AXIS_PAIRS)
+    return np.asarray(np.arcsin(np.sum(rows[..., first, :] * rows[..., second, :], axis=-1)))
 
 
 def bias_force(K: Float, D: Float) -> Float:
-    """Return the bias as specific force along each sensor axis, shape (3,).
+    """Return the bias as specific force along each sensor axis, shape (..., 3), of K_a in any gauge, and D_a.
 
-    Definition: D_i / K_ii. Units: m/s^2 (units of g when K is per g).
+    Definition: D_i / sensitivity. Units: m/s^2 (units of g when K is per g).
     """
-    return np.asarray(D / np.diagonal(K))
+    return np.asarray(D / sensitivity(K))
 
 
 def check_unit(output: Float, unit: str) -> None:

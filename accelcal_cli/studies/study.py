@@ -56,7 +56,7 @@ class Entry:
 
     def build(self) -> Optimizer[State]:
         """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
-        return OPTIMIZERS.build(self.optimizer, self.parameters, self.label)
+        return from_mapping(OPTIMIZERS.get(self.optimizer), self.parameters, self.label)
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _entry(item: Any, where: str) -> Entry:
     if "," in label or label == ALL:
         raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')
     parameters = {**shipped_parameters(entry.optimizer), **entry.parameters}
-    OPTIMIZERS.build(entry.optimizer, parameters, where)
+    from_mapping(OPTIMIZERS.get(entry.optimizer), parameters, where)
     return Entry(label, entry.optimizer, parameters)
 
 

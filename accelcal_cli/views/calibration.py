@@ -6,7 +6,14 @@ from itertools import chain
 
 import numpy as np
 
-from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, PARAMETERS, SCALE, UNDETERMINED, WEAK
+from accelcal_cli.calibration.observability import (
+    BIAS,
+    MISALIGNMENT,
+    PARAMETERS,
+    SCALE,
+    UNDETERMINED,
+    WEAK,
+)
 from accelcal_cli.calibration.result import Calibration, Temperature
 from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.poses import AXES
@@ -18,6 +25,9 @@ KINDS = (
     ("bias", BIAS, "micro-g", units.MICRO_G),
 )
 """Kinds of parameters with the unit that their sigma is shown in, and its size in parts of g."""
+
+KEYS = ("scale_factor_error", "misalignment", "bias")
+"""Names of the kinds in CSV."""
 
 WORST_SHOWN = 5
 INTERVAL = "+- 95 %"
@@ -68,8 +78,8 @@ def parameters(result: Calibration) -> Table:
     if result.gauge == "full" and not np.isfinite(result.sigma.K_a).all():
         notes.append(
             "In gauge full a rotation of the body frame is free and moves every entry of K_a; the search box alone "
-            "chose it. Observable, and with a sigma in the next table, are the scale factors and misalignments of "
-            "gauge lower and the bias."
+            "chose it. Observable, and with an interval in the next table, are the scale factors of the axes, the "
+            "angles between them and the bias."
         )
     return Table("Calibration", (Column("axis"), *chain.from_iterable(columns)), rows, tuple(notes))
 
@@ -87,14 +97,10 @@ def engineering(result: Calibration) -> Table:
     force = result.unit in ("g", "mg")  # in units of g, not in metres
     metres = units.STANDARD_GRAVITY / units.OUTPUT_OF_1_G[result.unit]
     per_g = units.OUTPUT_OF_1_G[result.unit] if force else result.g
-    # In gauge lower, as their intervals: another gauge, above all the free rotation of gauge full, moves a scale factor
-    # by half the square of the misalignments, which is many times their size.
-    K = result.model.in_gauge("lower").K
-    angle = units.misalignment(K)
-    angles = [angle[i, j] + angle[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
-    bias = units.bias_force(K, result.D_a - result.nominal_bias) / per_g
-    values = np.concatenate([units.scale_error(K, result.nominal_scale), angles, bias])
-    interval = result.interval_nine / per_g
+    values, sigma = result.engineering
+    values[BIAS] /= per_g
+    interval = result.interval_of(sigma)
+    interval[BIAS] /= per_g
     kinds = (
         ("scale factor error", "ppm", units.PPM, "%", 100.0),
         ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
@@ -130,14 +136,15 @@ def _reference(result: Calibration) -> str:
         nominal = ", ".join(f"{k:.6g}" for k in result.nominal_scale)
     offset = ", ".join(f"{d:g}" for d in result.nominal_bias) if result.nominal_bias.any() else "0"
     return (
-        f"Scale-factor errors against {nominal} output units per {result.unit}, biases against {offset} output units. "
+        f"Scale factor: sensitivity of the axis. Errors against {nominal} output units per {result.unit}, biases, as "
+        f"force along the axis, against {offset} output units. "
         "Misalignment: the angle by which two sensor axes miss 90 degrees."
     )
 
 
 def temperature(result: Calibration, slopes: Temperature) -> Table:
     """Return the change of scale factors and biases per degree."""
-    force = units.MICRO_G / np.diagonal(result.model.in_gauge("lower").K) / result.g
+    force = units.MICRO_G / units.sensitivity(result.K_a) / result.g
     rows = [
         (
             f"scale factor {AXES[i]}",
@@ -252,6 +259,7 @@ def values(result: Calibration) -> Table:
             names, *(e.ravel().tolist() for e in entries), lost.ravel().tolist(), units_, strict=True
         )
     ]
+    rows += _engineering_values(result)
     rows += [
         ("cost", result.cost, None, None, f"({result.unit})^4"),
         ("rms", result.rms, None, None, result.unit),
@@ -261,6 +269,24 @@ def values(result: Calibration) -> Table:
     ]
     columns = (Column("parameter"), Column("value"), Column("sigma"), Column("interval"), Column("unit"))
     return Table("Calibration", columns, tuple(rows))
+
+
+def _engineering_values(result: Calibration) -> list[tuple[object, ...]]:
+    """Return the engineering view as rows for CSV: name, value, sigma, interval, unit."""
+    values, sigma = result.engineering
+    table = np.stack([values, sigma, result.interval_of(sigma)])
+    table[:, BIAS] /= result.g
+    table[:, result.lost | result.held] = np.nan
+    names = [f"{kind}_{name.split()[-1]}" for kind, name in zip(np.repeat(KEYS, 3), PARAMETERS, strict=True)]
+    rows: list[tuple[object, ...]] = []
+    for p, (name, column) in enumerate(zip(names, table.T, strict=True)):
+        *_, unit, size = KINDS[p // 3]
+        rows.append((name, *(_finite(v * size) for v in column.tolist()), unit))
+    return rows
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def pose_residuals(result: Calibration) -> Table:
@@ -284,7 +310,10 @@ def pose_residuals(result: Calibration) -> Table:
 
 def accuracy(result: Calibration) -> str:
     """Say in one sentence how well the parameters are known; an empty text where the poses do not tell."""
-    interval = result.interval_nine / result.g
+    values, sigma = result.engineering
+    interval = result.interval_of(sigma)
+    interval[SCALE] /= 1.0 + values[SCALE]
+    interval[BIAS] /= result.g
     if result.verdict == "undetermined" or not np.isfinite(interval).all():
         return ""
     largest = [(name, interval[kind].max() * size, unit) for name, kind, unit, size in KINDS]

@@ -108,5 +108,6 @@ def record(detection: Detection) -> dict[str, Any]:
             "candidates": [{key: getattr(one, key) for key in keys} for one in detection.candidates],
             "poses": poses_table(detection).records(),
             "notes": [*detection.notes, detection.summary()],
+            "warnings": [asdict(notice) for notice in detection.warnings],
         }
     )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.fleet import FAILED, Fleet, Quantity, Standout, noise, parameters
+from accelcal_cli.calibration.fleet import FAILED, NOISE, Fleet, Standout
 from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.notices import Notice, in_one
 from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table
@@ -24,6 +24,10 @@ ADVICE = " Add these poses:"
 
 CLAUSE = re.compile(r"[:.] ")
 """Where the first clause of a warning ends."""
+
+RMS_BEFORE, RMS_AFTER = "rms of |f| - g before", "rms of |f| - g after"
+WORST_DOP = "worst dilution of precision"
+"""Names of the quantities that are shown beside the nine parameters and `NOISE`."""
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 VERDICTS = ("good", "weak", "suspect", "undetermined", FAILED)
@@ -56,7 +60,7 @@ def sensors(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout]) 
     ]
     names = np.full(len(labels), "", dtype=object)
     for one in standouts:
-        names[one.at] += ("; " if names[one.at] else "") + one.quantity.name
+        names[one.at] += ("; " if names[one.at] else "") + one.name
     columns = (
         Column("sensor"),
         Column("verdict"),
@@ -94,35 +98,44 @@ def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g
     if len(warned):
         shown.append(_warned(fleet, labels, warned, g))
     if standouts:
-        shown.append(_standing_out(labels, standouts))
+        shown.append(_standing_out(labels, standouts, g))
     bad = np.flatnonzero(fleet.verdict != "good")
     if len(bad):
         shown.append(_not_good(fleet, labels, bad))
     return shown
 
 
+def _formats(g: float) -> dict[str, tuple[str, str]]:
+    """Return unit and format of each quantity by its name, in the order in which they are shown."""
+    force = "g" if g == 1.0 else "m/s^2"
+    kinds = [(f"units per {force}", ".7g"), ("mrad", ".3f"), ("micro-g", ",.1f")]
+    return {
+        **{name: kinds[p // 3] for p, name in enumerate(PARAMETERS)},
+        RMS_BEFORE: (force, ".4g"),
+        RMS_AFTER: (force, ".4g"),
+        NOISE: (force, ".3g"),
+        WORST_DOP: ("", ".3f"),
+    }
+
+
 def _spread(fleet: Fleet, g: float) -> Table:
-    """Return quantiles of parameters, fit and dilution of precision over the sensors that their poses determine."""
-    known = fleet.determined
-    unit = "g" if g == 1.0 else "m/s^2"
-    quantities = [
-        *parameters(fleet, g),
-        Quantity("rms of |f| - g before", unit, ".4g", fleet.rms_before),
-        Quantity("rms of |f| - g after", unit, ".4g", fleet.rms),
-        noise(fleet, g),
-        Quantity("worst dilution of precision", "", ".3f", fleet.dop.max(axis=1)),
-    ]
+    """Return quantiles of parameters, fit and dilution of precision over the sensors with a verdict to use."""
+    quantities = {
+        **dict(zip(PARAMETERS, fleet.parameters.T, strict=True)),
+        RMS_BEFORE: fleet.rms_before,
+        RMS_AFTER: fleet.rms,
+        NOISE: fleet.s,
+        WORST_DOP: fleet.dop.max(axis=1),
+    }
     rows = []
-    for quantity in quantities:
-        values = quantity.values[known]
+    for name, (unit, spec) in _formats(g).items():
+        values = quantities[name][fleet.determined]
         values = values[np.isfinite(values)]
         if len(values):
             row = np.quantile(values, QUANTILES).tolist()
-            rows.append((quantity.name, *(format(v, quantity.format) for v in row), quantity.unit))
+            rows.append((name, *(format(v, spec) for v in row), unit))
     columns = ("quantity", "least", "5 %", "median", "95 %", "greatest", "unit")
-    note = (
-        "Scale factors, misalignments and biases in gauge lower, of the sensors that their poses determine."
-    )
+    note = "Scale factors, misalignments and biases of the engineering view, of the sensors that their poses determine."
     return Table("Fleet", tuple(Column(name) for name in columns), tuple(rows), (note,))
 
 
@@ -162,15 +175,15 @@ def _more(number: int, where: str = "") -> tuple[str, ...]:
     return (f"And {number - SHOWN:,} more{where}.",) if number > SHOWN else ()
 
 
-def _standing_out(labels: Sequence[str], standouts: Sequence[Standout]) -> Table:
+def _standing_out(labels: Sequence[str], standouts: Sequence[Standout], g: float) -> Table:
     """Return the sensors that stand out from the fleet."""
+    formats = _formats(g)
     rows = tuple(
         (
             labels[one.at],
-            one.quantity.name,
-            format(one.value, one.quantity.format),
-            format(one.middle, one.quantity.format),
-            one.quantity.unit,
+            one.name,
+            *(format(value, formats[one.name][1]) for value in (one.value, one.middle)),
+            formats[one.name][0],
             one.z,
         )
         for one in standouts[:SHOWN]

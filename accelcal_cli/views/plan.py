@@ -7,7 +7,7 @@ import numpy as np
 from accelcal_cli.calibration.observability import PARAMETERS, UNDETERMINED
 from accelcal_cli.planning import Plan
 from accelcal_cli.schema import to_mapping
-from accelcal_cli.sensor.poses import describe
+from accelcal_cli.sensor.poses import AXES, describe
 from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Table
 from accelcal_cli.views.calibration import KINDS
 
@@ -76,6 +76,7 @@ def record(plan: Plan) -> dict[str, object]:
             "verdict": plan.verdict,
             "noise": plan.noise,
             "so_far": plan.so_far and {key: getattr(plan.so_far, key) for key in SO_FAR},
+            "dop_cubic": [_finite(dop) for dop in plan.cubic.tolist()],
             "poses": pose_table(plan).records(),
             "parameters": parameter_table(plan).records(),
         }
@@ -99,10 +100,19 @@ def _notes(plan: Plan) -> tuple[str, ...]:
         )
     if plan.verdict != "undetermined":
         aligned = plan.so_far is not None and plan.so_far.held.any()
-        return (ALIGNED_NOTE,) if aligned else ()
+        return (*((ALIGNED_NOTE,) if aligned else ()), _cubic_note(plan))
     lost = plan.stages[-1].above(UNDETERMINED)
     named = ", ".join(lost) if 0 < len(lost) < len(PARAMETERS) else "all nine parameters"
     return (f"Still not determined after these poses: {named}. Plan more poses, or another fixture.",)
+
+
+def _cubic_note(plan: Plan) -> str:
+    """Return which axes show a cubic nonlinearity in these poses."""
+    blind = [axis for axis, dop in zip(AXES, plan.cubic, strict=True) if not np.isfinite(dop)]
+    if not blind:
+        return f"Cubic nonlinearity shows in these poses (DOP up to {plan.cubic.max():.3g})."
+    axes = "any axis" if len(blind) == 3 else f"axis {' and '.join(blind)}"
+    return f"Cubic nonlinearity of {axes} does not show in these poses: it looks like a scale factor."
 
 
 def _finite(value: float) -> float | None:

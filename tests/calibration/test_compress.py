@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, direct_cost, dpso_box, loetters, noise
 
-from accelcal_cli.calibration.problem import Loetters, Triangle, compress, compress_each, rows
+from accelcal_cli.calibration.problem import Loetters
+from accelcal_cli.calibration.triangle import Triangle, compress, compress_each, rows
 from accelcal_cli.rng import Streams
 
 G = 9.8

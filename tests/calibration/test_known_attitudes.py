@@ -11,7 +11,7 @@ import scipy.stats
 from simulated import MEMS, noise, rotation
 
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.fit import OUTLIER_LEVEL
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError

@@ -23,6 +23,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.cli.export import command
 from accelcal_cli.errors import UsageError
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
+from accelcal_cli.exporters.diagonal import Triad
 from accelcal_cli.notices import Notice
 
 READING = np.array([[0.3, -4.0, 8.9], [1.0, 9.7, -0.2], [-5.0, 5.0, -6.0]])
@@ -162,5 +163,5 @@ def gives_the_force(cls: type[Exporter], result: Calibration, scale: float, read
     if not any("misalignments" in warning for warning in export.warnings):
         np.testing.assert_allclose(force, exact, rtol=1e-12, atol=1e-12)
         return
-    diagonal = (scale * READING - result.D_a) / np.diagonal(result.K_a)
+    diagonal = (scale * READING - result.D_a) * Triad.of(result.K_a).scale
     np.testing.assert_allclose(force, diagonal, rtol=1e-7, atol=1e-7)

@@ -39,7 +39,7 @@ def metres():
 
 @pytest.fixture(scope="module")
 def with_slopes(metres):
-    slopes = [np.full(3, 1e-4)] * 4
+    slopes = [np.full(3, 1e-4)] * 6
     return replace(metres, temperature=Temperature(25.0, 10.0, 40.0, *slopes, np.ones(6)))
 
 

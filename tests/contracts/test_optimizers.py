@@ -12,6 +12,7 @@ import pytest
 from accelcal_cli.config import load_mapping
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, State, optimizer_file
+from accelcal_cli.schema import from_mapping
 
 NAMES = OPTIMIZERS.names()
 PAIRS = [(name, case) for name in NAMES for case in contract.cases(OPTIMIZERS.get(name))]
@@ -120,16 +121,17 @@ def test_the_contract_sees_runs_that_share_their_random_numbers(monkeypatch):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_optimizer_ships_its_settings(name):
-    """One YAML file an algorithm: it names its source and states every setting there is."""
+    """One YAML file an algorithm: it names its source and states every setting, of a built-in one the default."""
     record = load_mapping(optimizer_file(name))
     cls = OPTIMIZERS.get(name)
     assert record["optimizer"] == name
     assert record["source"]
     assert set(record["parameters"]) == {field.name for field in dataclasses.fields(cls)}
-    built = OPTIMIZERS.build(name, record["parameters"], name)
+    built = from_mapping(OPTIMIZERS.get(name), record["parameters"], name)
     for key, stated in record["parameters"].items():
         value = getattr(built, key)
         assert (list(value) if isinstance(value, tuple) else value) == stated
+    assert built == cls() or not OPTIMIZERS.is_built_in(cls)
     assert set(record) == {"optimizer", "source", "parameters"}
 
 

@@ -11,14 +11,16 @@ import subprocess
 import numpy as np
 import pytest
 import yaml
-from simulated import MEMS, readings
+from simulated import MEMS, readings, rotation
 
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, UsageError
 from accelcal_cli.exporters.base import EXPORTERS
-from accelcal_cli.io.readings import read_readings
+from accelcal_cli.exporters.diagonal import Triad
+from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.notices import Notice
+from accelcal_cli.schema import from_mapping
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 
@@ -47,8 +49,17 @@ def counts():
     return result(COUNTS)
 
 
+@pytest.fixture(scope="module")
+def turned():
+    """Known attitudes, mounted at random."""
+    turn = rotation(4)
+    u = G * poses.turns()
+    output = ErrorModel(MEMS.K @ turn, MEMS.D).output(u)
+    return calibrate(Readings.from_array(output, reference=u), Settings(g=G, attitudes="known"))
+
+
 def export(found, name, **options):
-    return EXPORTERS.build(name, options, name).export(found)
+    return from_mapping(EXPORTERS.get(name), options, name).export(found)
 
 
 def text(made):
@@ -56,7 +67,7 @@ def text(made):
 
 
 def diagonal(K, D, reading):
-    return (reading - D) / np.diagonal(K)
+    return (reading - D) * Triad.of(K).scale
 
 
 def parameters(made, separator):
@@ -85,8 +96,8 @@ def test_an_autopilot_gets_the_diagonal_model(metres, name):
     made = export(metres, name)
     force = autopilot(parameters(made, separator), offset, scale, READING)
     np.testing.assert_allclose(force, diagonal(metres.K_a, metres.D_a, READING), rtol=1e-7, atol=1e-7)
-    exact = metres.model.specific_force(READING)
-    told = float(made.warnings[0].split("error of up to ")[1].split()[0])
+    exact = metres.model.specific_force(READING) @ Triad.of(metres.K_a).axes.T
+    told = float(made.warnings[0].split("and up to ")[1].split()[0])
     lengths = np.linalg.norm(exact, axis=1)
     assert (np.linalg.norm(force - exact, axis=1) <= 1.05 * told * lengths / G + 1e-6).all()
 
@@ -125,11 +136,47 @@ def test_warnings_stand_in_the_comments(metres):
         assert "warning: The sensor moved." in text(export(doubtful, name))
 
 
-def test_the_symmetric_gauge_halves_what_an_autopilot_drops(metres):
-    def angle(which):
-        return float(export(which, "px4").warnings[0].split("up to ")[1].split()[0])
+def numbers(made):
+    return [line for line in text(made).splitlines() if not line.startswith("#")]
 
-    assert angle(result(gauge="symmetric")) < 0.7 * angle(metres)
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+def test_an_autopilot_gets_the_same_numbers_in_every_gauge(metres, name):
+    for gauge in ("upper", "symmetric", "full"):
+        other = export(result(gauge=gauge), name)
+        for line, expected in zip(numbers(other), numbers(export(metres, name)), strict=True):
+            assert line.replace("\t", ",").split(",")[0] == expected.replace("\t", ",").split(",")[0]
+        np.testing.assert_allclose(
+            list(parameters(other, AUTOPILOTS[name][0]).values()),
+            list(parameters(export(metres, name), AUTOPILOTS[name][0]).values()),
+            rtol=1e-6,
+            atol=1e-8,
+        )
+
+
+def test_no_diagonal_leaves_a_smaller_rms_error(metres):
+    from scipy.optimize import minimize
+    from scipy.spatial.transform import Rotation
+
+    u = poses.fibonacci(2000)
+
+    def rms(values):
+        frame = Rotation.from_rotvec(values[3:]).as_matrix()
+        error = (G * u @ metres.K_a.T) * values[:3] - G * u @ frame.T
+        return np.sqrt((error**2).sum(axis=1).mean())
+
+    start = np.concatenate([1.0 / np.diagonal(metres.K_a), np.zeros(3)])
+    least = minimize(
+        rms, start, method="Nelder-Mead", options={"maxiter": 6000, "fatol": 1e-12, "xatol": 1e-8}
+    )
+    told = float(text(export(metres, "px4")).split("can leave: ")[1].split()[0])
+    assert told == pytest.approx(least.fun, rel=5e-3)
+    triad = Triad.of(metres.K_a)
+    assert triad.rms * G == pytest.approx(least.fun, rel=1e-3)
+    np.testing.assert_allclose(triad.scale, least.x[:3], rtol=1e-4)
+    for gauge in ("lower", "symmetric"):
+        K = metres.model.in_gauge(gauge).K
+        assert np.linalg.norm(K / np.diagonal(K)[:, None] - np.eye(3)) / np.sqrt(3) >= triad.rms
 
 
 def test_instances_have_their_names(metres):
@@ -178,6 +225,26 @@ def test_imucal_corrects_with_two_matrices(which, unit, request):
     assert (record["cal_type"], record["_format_version"]) == ("Ferraris", "2.0.0")
     assert (record["acc_unit"], record["from_acc_unit"]) == (found.unit, unit)
     np.testing.assert_array_equal(record["K_g"], np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("which", "unit"), [("metres", "m/s^2"), ("in_g", "g"), ("counts", "a.u."), ("turned", "m/s^2")]
+)
+def test_imucal_itself_loads_and_applies_the_file(which, unit, request, tmp_path):
+    imucal = pytest.importorskip("imucal")
+    management = pytest.importorskip("imucal.management")
+    found = request.getfixturevalue(which)
+    path = tmp_path / "calibration.json"
+    path.write_bytes(export(found, "imucal").content)
+    info = management.load_calibration_info(path)
+    assert isinstance(info, imucal.FerrarisCalibrationInfo)
+    raw = READING * (415 if which == "counts" else 1)
+    gyroscope = np.array([[1.0, -2.0, 3.0]] * len(raw))
+    force, rate = info.calibrate(raw, gyroscope, acc_unit=unit, gyr_unit="deg/s")
+    np.testing.assert_allclose(force, found.model.specific_force(raw), rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(rate, gyroscope)
+    np.testing.assert_allclose(np.linalg.norm(info.R_a, axis=1), 1.0, rtol=1e-12)
+    assert info.acc_unit == found.unit
 
 
 @pytest.mark.parametrize("which", ["metres", "in_g", "counts"])
@@ -251,5 +318,5 @@ def test_the_misalignment_of_a_real_sensor_is_warned_of(shared_data, name):
     )
     made = export(found, name)
     for place in (made.warnings[0], text(made)):
-        assert "53.2 mrad (0.053 rad, axis z towards x)" in place
-        assert "0.54 m/s^2" in place
+        assert "mrad (0.053 rad)" in place
+        assert "axes x and z miss 90 degrees" in place

@@ -143,7 +143,7 @@ def test_csv_has_a_row_a_parameter(run, good):
     assert float(value["D_3"]) == result["D_a"][2]
     assert float(rows[0]["sigma"]) == result["sigma"]["K_a"][0][0]
     assert value["verdict"] == "good"
-    assert len(rows) == 16
+    assert len(rows) == 17
 
 
 def test_the_table_says_it_all(run, good):

@@ -74,7 +74,7 @@ def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
     assert verified.err.startswith(f"accelcal: wrong.yaml: warning: {said}")
     for outcome in (verified, run("plan", log)):
         assert f"\nWarning: {said}" in outcome.out
-        assert "raw.csv" not in outcome.err
+        assert "accelcal: raw.csv" not in outcome.err
     assert run("plan", log, "--format", "csv").err.startswith(f"accelcal: raw.csv: warning: {said}")
     assert run("detect", log, "-o", "poses.csv").code == 0
     assert said not in run("calibrate", "poses.csv", "--optimizer", "ellipsoid").out.replace("\n", " ")

@@ -93,7 +93,7 @@ def test_what_calibrate_says_of_the_poses_so_far_is_carried_on(run, tmp_path):
     shown = run("plan", "r.csv", "--add", "2")
     assert (shown.code, shown.err) == (1, "")
     assert shown.out.startswith("Verdict so far: undetermined\n  The least cost lies outside the search box")
-    assert "Caution: Residuals are too large" in shown.out
+    assert "Warning: Residuals are too large" in shown.out
     assert "More poses do not change the verdict on those so far" in shown.out
 
 

@@ -96,7 +96,7 @@ def test_readings_that_cannot_tell_fail(run, result, other):
     assert (shown.code, shown.err) == (1, "")
     assert shown.out.startswith("Verdict: inconclusive\n")
     assert (
-        "Warning: Outlier: line 5 does not fit the other poses (p < 0.01). Measure it again.\n" in shown.out
+        "Warning: Outlier: line 5 does not fit the other poses (p < 0.002). Measure it again.\n" in shown.out
     )
     plain = run("verify", result, "wrong.csv", "--format", "json")
     record = json.loads(plain.out)

@@ -16,6 +16,7 @@ from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import bound
 from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
+from accelcal_cli.schema import from_mapping
 
 WINDOW = 5
 
@@ -177,7 +178,7 @@ def test_a_metropolis_move_leaves_the_line_of_the_cloud_by_a_thousandth_of_sigma
 def test_particles_that_move_keep_the_weight_that_they_had_together(flat, name):
     """Where the map shows nothing an evolution must not make a place more likely."""
     settings = {"particles": 50, "strategy": "safe"} if name == "de-pf" else {"particles": 50}
-    form = FILTERS.build(name, settings, "test")
+    form = from_mapping(FILTERS.get(name), settings, "test")
     streams = Streams(6, range(2), Purpose.FILTER)
     logs = 3.0 * Streams(7, range(2)).normal(50, 1)[..., 0]
     logs -= logs.max(axis=1, keepdims=True)  # as the filter carries them on

@@ -20,13 +20,16 @@ from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import bound, counted, score
 from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
+from accelcal_cli.schema import from_mapping
 
 NAMES = ["apo-pf", "de-pf", "pf", "pso-pf", "reference"]
 
 
 def run(scenario, name, seed=1, runs=range(6), **settings):
     with np.errstate(all="ignore"):
-        track = FILTERS.build(name, settings, "test").run(scenario, Streams(seed, runs, Purpose.FILTER))
+        track = from_mapping(FILTERS.get(name), settings, "test").run(
+            scenario, Streams(seed, runs, Purpose.FILTER)
+        )
         return track, score(scenario, track)
 
 
@@ -116,7 +119,7 @@ def test_a_generation_of_de_is_equations_3_to_7():
 def test_a_step_of_pso_is_towards_the_best():
     """At first every particle is its own best: v = |n2| (gbest - x)."""
     x = Streams(0, [0], 9).normal(10, 2)
-    swarm = FILTERS.build("pso-pf", {"generations": 1}, "test")
+    swarm = from_mapping(FILTERS.get("pso-pf"), {"generations": 1}, "test")
     moved = swarm.evolve(x, hill(x), 10, hill, Streams(1, [0], 9))
     pull = np.abs(Streams(1, [0], 9).normal(10, 4))[..., 2:]
     np.testing.assert_allclose(moved, x + pull * (x[:, hill(x)[0].argmax()] - x))
@@ -125,7 +128,7 @@ def test_a_step_of_pso_is_towards_the_best():
 @pytest.mark.parametrize("name", ["de-pf", "pso-pf", "apo-pf"])
 def test_evolution_climbs_and_leaves_the_others_alone(name):
     x = 1.5 * Streams(0, range(3), 9).normal(40, 2) + np.array([1.0, -1.0])
-    moved = FILTERS.build(name, {}, "test").evolve(x, hill(x), 15, hill, Streams(1, range(3), 9))
+    moved = from_mapping(FILTERS.get(name), {}, "test").evolve(x, hill(x), 15, hill, Streams(1, range(3), 9))
     assert (moved[:, 15:] == x[:, 15:]).all()
     assert hill(moved)[:, :15].mean() > 0.7 * hill(x)[:, :15].mean()
 
@@ -282,10 +285,12 @@ def test_residual_resampling_and_twelve_states_beat_the_ins(rough, settings):
 def test_a_setting_without_effect_on_its_strategy_is_refused(strategy, idle):
     other = {"resampling": "residual", "state": 12, "mutation": "rand-to-best", "window": 7}.get(idle, 0.75)
     with pytest.raises(ConfigError, match=f"{idle}: has no effect with strategy {strategy}"):
-        FILTERS.build("de-pf", {"strategy": strategy, idle: 1.5 if "inflation" in idle else other}, "de-pf")
+        from_mapping(
+            FILTERS.get("de-pf"), {"strategy": strategy, idle: 1.5 if "inflation" in idle else other}, "de-pf"
+        )
 
 
 def test_settings_with_effect_are_taken():
-    FILTERS.build("de-pf", {"strategy": "safe", "fraction": 0.4, "weight_max": 0.7}, "de-pf")
-    FILTERS.build("de-pf", {"strategy": "window", "window": 4}, "de-pf")
-    FILTERS.build("de-pf", {"mode": "literal", "mutation": "rand-to-best"}, "de-pf")
+    from_mapping(FILTERS.get("de-pf"), {"strategy": "safe", "fraction": 0.4, "weight_max": 0.7}, "de-pf")
+    from_mapping(FILTERS.get("de-pf"), {"strategy": "window", "window": 4}, "de-pf")
+    from_mapping(FILTERS.get("de-pf"), {"mode": "literal", "mutation": "rand-to-best"}, "de-pf")

@@ -135,22 +135,25 @@ def test_engineering_units():
     assert (units.PPM, units.MRAD, units.MICRO_G) == (1e6, 1e3, 1e6)
 
 
-def test_scale_misalignment_and_bias():
-    K = np.array([[102.0, 0.51, -1.02], [0.98, 98.0, 0.0], [0.0, 2.0, 100.0]])
-    np.testing.assert_allclose(units.scale_error(K, np.full(3, 100.0)), [0.02, -0.02, 0.0], atol=1e-15)
-    angles = units.misalignment(K)
-    np.testing.assert_allclose(angles, [[0, 0.005, -0.01], [0.01, 0, 0], [0, 0.02, 0]], atol=1e-15)
-    np.testing.assert_allclose(units.bias_force(K, np.array([204.0, -49.0, 10.0])), [2.0, -0.5, 0.1])
-    assert K[0, 0] == 102.0
+def test_scale_factors_misalignments_and_biases_by_hand():
+    K = np.array([[102.0, 0.0, 0.0], [30.0, 40.0, 0.0], [0.0, 28.0, 96.0]])
+    np.testing.assert_allclose(units.sensitivity(K), [102.0, 50.0, 100.0])
+    np.testing.assert_allclose(
+        units.scale_error(K, np.array([100.0, 50.0, 80.0])), [0.02, 0.0, 0.25], atol=1e-15
+    )
+    np.testing.assert_allclose(units.misalignment(K), np.arcsin([0.6, 0.0, 0.8 * 0.28]), atol=1e-15)
+    np.testing.assert_allclose(units.bias_force(K, np.array([204.0, -25.0, 10.0])), [2.0, -0.5, 0.1])
 
 
-@given(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
-def test_the_sum_of_two_misalignments_is_the_angle_that_axes_miss(first, second):
-    """Sensor axes x and y meet at 90 degrees less K_12/K_11 + K_21/K_22, to first order, whatever the gauge."""
-    K = np.diag([3.0, 5.0, 4.0]) @ np.array([[1.0, first, 0.0], [second, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    angles = units.misalignment(K)
-    x, y = K[0] / np.linalg.norm(K[0]), K[1] / np.linalg.norm(K[1])
-    assert angles[0, 1] + angles[1, 0] == pytest.approx(np.pi / 2 - np.arccos(x @ y), abs=3e-5)
+@given(st.lists(st.floats(-0.2, 0.2), min_size=6, max_size=6))
+def test_misalignments_are_what_two_axes_miss_of_90_degrees_in_any_gauge(off):
+    K = np.diag([3.0, 5.0, 4.0]) @ (np.eye(3) + np.array([[0, *off[:2]], [off[2], 0, off[3]], [*off[4:], 0]]))
+    rows = K / np.linalg.norm(K, axis=1)[:, None]
+    missed = [np.pi / 2 - np.arccos(rows[i] @ rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    for gauge in units.GAUGES:
+        seen = units.to_gauge(K, gauge)
+        np.testing.assert_allclose(units.misalignment(seen), missed, atol=1e-12)
+        np.testing.assert_allclose(units.sensitivity(seen), units.sensitivity(K), rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -44,26 +44,28 @@ def test_parameters_are_the_matrix_and_the_bias(result):
     for i, axis in enumerate("xyz"):
         values = rows[axis]
         np.testing.assert_array_equal(values[0:6:2], result.K_a[i])
-        np.testing.assert_array_equal(values[1:6:2], result.sigma.K_a[i])
-        assert tuple(values[6:]) == (result.D_a[i], result.sigma.D_a[i])
+        np.testing.assert_array_equal(values[1:6:2], result.interval.K_a[i])
+        assert tuple(values[6:]) == (result.D_a[i], result.interval.D_a[i])
 
 
 def test_the_engineering_view_by_hand(result):
     rows = _cells(tables.engineering(result))
-    sigma = np.sqrt(np.diagonal(result.covariance))
-    value, one_sigma, unit, percent, _, second = rows["scale factor error x"]
+    sigma = result.coverage_factor * result.engineering[1]
+    lengths = np.linalg.norm(result.K_a, axis=1)
+    value, one_sigma, unit, percent, _, second = rows["scale factor error y"]
     assert (unit, second) == ("ppm", "%")
-    assert value == pytest.approx((result.K_a[0, 0] / 5.6e5 - 1) * 1e6, rel=1e-9)
+    assert value == pytest.approx((lengths[1] / 5.6e5 - 1) * 1e6, rel=1e-9)
     assert percent == pytest.approx(value / 1e4, rel=1e-12)
-    assert one_sigma == pytest.approx(sigma[0] / G * 1e6, rel=1e-9)
-    value, one_sigma, unit, arcsec, _, second = rows["misalignment xy"]
+    assert one_sigma == pytest.approx(sigma[1] * 1e6, rel=1e-9)
+    value, one_sigma, unit, arcsec, _, second = rows["misalignment yz"]
     assert (unit, second) == ("mrad", "arcsec")
-    assert value == pytest.approx(result.K_a[1, 0] / result.K_a[1, 1] * 1e3, rel=1e-9)
+    cosine = result.K_a[1] @ result.K_a[2] / lengths[1] / lengths[2]
+    assert value == pytest.approx(np.arcsin(cosine) * 1e3, rel=1e-9)
     assert arcsec == pytest.approx(value * 1e-3 * 180 * 3600 / np.pi, rel=1e-12)
-    assert one_sigma == pytest.approx(sigma[3] / G * 1e3, rel=1e-9)
+    assert one_sigma == pytest.approx(sigma[5] * 1e3, rel=1e-9)
     value, one_sigma, unit, force, _, second = rows["bias y"]
     assert (unit, second) == ("micro-g", "m/s^2")
-    assert force == pytest.approx(result.D_a[1] / result.K_a[1, 1], rel=1e-9)
+    assert force == pytest.approx(result.D_a[1] / lengths[1], rel=1e-9)
     assert value == pytest.approx(force / G * 1e6, rel=1e-9)
     assert one_sigma == pytest.approx(sigma[7] / G * 1e6, rel=1e-9)
 
@@ -76,7 +78,7 @@ def test_the_engineering_view_does_not_depend_on_the_gauge():
             calibrate(data, _settings(gauge=gauge, nominal=Nominal(scale=(5.67e5,) * 3)))
         )
         views.append([row[1] for row in table.rows])
-    np.testing.assert_allclose(views[1:], [views[0]] * 3, atol=0.01)  # ppm, mrad and micro-g
+    np.testing.assert_allclose(views[1:], [views[0]] * 3, rtol=1e-7, atol=1e-4)  # ppm, mrad and micro-g
 
 
 def test_a_result_in_units_of_g():
@@ -84,7 +86,7 @@ def test_a_result_in_units_of_g():
     result = calibrate(data, _settings(g=1.0))
     value, _, unit, force, _, second = _cells(tables.engineering(result))["bias x"]
     assert (unit, second) == ("micro-g", "m/s^2")
-    assert value == pytest.approx(result.D_a[0] / result.K_a[0, 0] * 1e6, rel=1e-9)
+    assert value == pytest.approx(result.D_a[0] / np.linalg.norm(result.K_a[0]) * 1e6, rel=1e-9)
     assert force == pytest.approx(value * 1e-6 * units.STANDARD_GRAVITY, rel=1e-9)
     assert dict(_cells(tables.fit(result)))["local gravity g"][1] == "g"
 
@@ -130,7 +132,9 @@ def test_what_is_not_determined_is_not_shown_as_a_number():
     assert {row[2] for row in tables.observability(result).rows} >= {"undetermined", "good"}
     empty = {row[0] for row in tables.values(result).rows if row[1] is None}
     below = {f"K_{i}{j}" for i in (1, 2, 3) for j in range(1, i + 1)}
-    assert empty == below | {"D_1", "D_2", "D_3"}
+    engineering = {f"{kind}_{axis}" for kind in ("scale_factor_error", "bias") for axis in "xyz"}
+    engineering |= {f"misalignment_{pair}" for pair in ("xy", "xz", "yz")}
+    assert empty == below | {"D_1", "D_2", "D_3"} | engineering
 
 
 def test_nine_poses_have_values_without_sigma():

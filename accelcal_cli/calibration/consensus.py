@@ -1,0 +1,188 @@
+"""Which poses agree: a start for robust losses that gross errors do not reach, and the names of those that do not.
+
+Up to a quarter of the poses may be wrong by any factor. Ellipsoids through random subsets of the poses are each judged
+by the smaller three quarters of their squared residuals; the best are refined by fitting those poses again until
+nothing changes (least trimmed squares with concentration steps [rousseeuw2006]). From the best one the agreeing poses
+grow: a pose that the others would not call an outlier joins them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.calibration.distributions import student_chance
+from accelcal_cli.calibration.observability import ALIGNED, design
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.rng import Purpose, Streams
+
+SUBSETS, REFINED = 1000, 12
+"""Subsets that are drawn: of ten poses with a quarter wrong one in eighteen is clean. And how many are refined."""
+
+STEPS = 30
+"""Concentration steps, and rounds of growing, at most."""
+
+WRONG = 4
+"""One pose in so many may be wrong."""
+
+SPARE = 6
+"""Sound poses beyond the parameters that a consensus needs."""
+
+LOOKED_AT = 2000
+"""Rows of a longer input that the consensus is searched among."""
+
+LEVEL = 0.01
+"""Chance of rejecting a pose where none is wrong (Bonferroni over the poses)."""
+
+TRIMMED = 0.607
+"""Standard deviation of the smaller three quarters of normal residuals, over that of all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """What most poses of one sensor agree on.
+
+    Attributes:
+        agreeing: which poses do, shape (J,).
+        s: standard deviation of their residuals, m/s^2.
+    """
+
+    agreeing: Bool
+    s: float
+
+
+def consensus(sample: Sample, settings: Settings) -> Consensus | None:
+    """Return the consensus of the poses of one sensor; None where they are too few for one, or have none."""
+    N = sample.output()[0]
+    columns = np.flatnonzero(~ALIGNED) if not settings.misalignment else np.arange(9)
+    free = len(columns)
+    if len(N) < free + SPARE + 1:
+        return None
+    middle, size = np.median(N, axis=0), float(np.median(np.abs(N - np.median(N, axis=0)).max(axis=1)))
+    if not size > 0:
+        return None
+    x = (N - middle) / size
+    random = Streams(settings.seed, [0], Purpose.CONSENSUS)
+    looked = np.arange(len(x))
+    if len(x) > LOOKED_AT:
+        looked = np.sort(np.argsort(random.uniform(1, len(x))[0, 0], kind="stable")[:LOOKED_AT])
+    terms = _terms(x[looked])[:, columns]  # in the order of the parameters that they determine
+    subset = _best_subset(terms, random)
+    if subset is None:
+        return None
+    kept = _grown(x, looked[subset], columns)
+    if kept is None:
+        return None
+    agreeing, s = kept
+    return Consensus(agreeing, s * settings.g)
+
+
+def _terms(x: Float) -> Float:
+    """Return x^2, y^2, z^2, 2xy, 2xz, 2yz, 2x, 2y, 2z of readings, shape (J, 3): shape (J, 9)."""
+    pairs = [2.0 * x[:, i] * x[:, j] for i, j in ((0, 1), (0, 2), (1, 2))]
+    return np.column_stack([x**2, *pairs, 2.0 * x])
+
+
+def _solved(terms: Float, member: Float) -> Float:
+    """Return the quadrics y, shape (M, p), with terms . y = 1 for the members, 0 or 1, shape (M, J)."""
+    normal = (terms.T[None] * member[:, None]) @ terms
+    right = member @ terms
+    size = np.einsum("mpp->m", normal)
+    with np.errstate(all="ignore"):
+        normal = normal + (1e-13 * size)[:, None, None] * np.eye(terms.shape[1])
+        return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
+
+
+def _errors(terms: Float, y: Float) -> Float:
+    """Return e / g, shape (M, J), of quadrics y, shape (M, p), where they are ellipsoids; infinite elsewhere.
+
+    With y the quadric x^T A x + 2 m^T x = 1, |f|^2 / g^2 = 1 + (terms . y - 1) / (1 + m^T A^-1 m).
+    """
+    p = y.shape[1]
+    A, m = np.zeros((len(y), 3, 3)), y[:, p - 3 :]
+    A[:, [0, 1, 2], [0, 1, 2]] = y[:, :3]
+    if p == 9:
+        A[:, [0, 0, 1], [1, 2, 2]] = A[:, [1, 2, 2], [0, 0, 1]] = y[:, 3:6]
+    finite = np.asarray(np.isfinite(y).all(axis=1))
+    values = np.linalg.eigvalsh(np.where(finite[:, None, None], A, np.eye(3)))
+    sound = finite & (values[:, 0] > 1e-9 * values[:, 2])
+    solved = np.linalg.solve(np.where(sound[:, None, None], A, np.eye(3)), m[..., None])[..., 0]
+    level = 1.0 + np.sum(m * solved, axis=1)
+    sound &= level > 0
+    with np.errstate(all="ignore"):
+        e = -0.5 * (y @ terms.T - 1.0) / level[:, None]
+    return np.where(sound[:, None], e, np.inf)
+
+
+def _best_subset(terms: Float, random: Streams) -> Int | None:
+    """Return the numbers of the three quarters of the rows that agree best, or None."""
+    poses, free = terms.shape
+    most = poses - poses // WRONG
+    order = np.argsort(random.uniform(SUBSETS, poses)[0], axis=1, kind="stable")
+    member = np.zeros((SUBSETS, poses))
+    np.put_along_axis(member, order[:, : free + 1], 1.0, axis=1)
+    objective = np.full(SUBSETS, np.inf)
+    for step in range(STEPS):
+        e = _errors(terms, _solved(terms, member))
+        square = e * e
+        inner = np.argpartition(square, most - 1, axis=1)[:, :most]
+        value = np.take_along_axis(square, inner, axis=1).sum(axis=1)
+        if step == 2:  # two steps tell which subsets are worth more
+            best = np.argsort(value, kind="stable")[:REFINED]
+            value, inner, objective = value[best], inner[best], np.full(REFINED, np.inf)
+        if step > 2 and not (value < objective * (1.0 - 1e-9)).any():
+            break
+        objective = value
+        member = np.zeros((len(inner), poses))
+        np.put_along_axis(member, inner, 1.0, axis=1)
+    at = int(np.argmin(objective))
+    return np.flatnonzero(member[at]) if np.isfinite(objective[at]) else None
+
+
+def _grown(x: Float, start: Int, columns: Int) -> tuple[Bool, float] | None:
+    """Return which of all rows agree, shape (J,), and the standard deviation of their e / g.
+
+    Args:
+        x: readings, shape (J, 3); start: numbers of rows that agree; columns: of the free parameters.
+    """
+    poses, free = len(x), len(columns)
+    terms = _terms(x)[:, columns]
+    agreeing = np.zeros(poses, dtype=bool)
+    agreeing[start] = True
+    scale = TRIMMED
+    for _ in range(STEPS):
+        count = int(agreeing.sum())
+        y = _solved(terms, agreeing[None].astype(float))
+        e = _errors(terms, y)[0]
+        if not np.isfinite(e).all() or count <= free:
+            return None
+        s = float(np.sqrt(np.sum(e[agreeing] ** 2) / (count - free))) / scale
+        leverage = _leverage(x, y[0], agreeing, columns)
+        room = np.where(agreeing, np.maximum(1.0 - leverage, 1e-9), 1.0 + leverage)
+        if s <= 0:
+            return agreeing, s
+        t = np.abs(e) / (s * np.sqrt(room))
+        chance = student_chance(np.maximum(t, 1e-9), np.full(poses, max(count - free, 1)))
+        grown = poses * chance >= LEVEL
+        scale = 1.0
+        if (grown == agreeing).all():
+            break
+        agreeing = grown
+    return agreeing, s
+
+
+def _leverage(x: Float, y: Float, agreeing: Bool, columns: Int) -> Float:
+    """Return the leverage of every row, shape (J,), in a fit of the agreeing ones."""
+    p = len(y)
+    A = np.diag(y[:3])
+    if p == 9:
+        A[[0, 0, 1], [1, 2, 2]] = A[[1, 2, 2], [0, 0, 1]] = y[3:6]
+    centre = -np.linalg.solve(A, y[p - 3 :])
+    f = (x - centre) @ np.linalg.cholesky(A)
+    rows = design(f / np.linalg.norm(f, axis=1, keepdims=True))[:, columns]
+    normal = rows[agreeing].T @ rows[agreeing]
+    cofactor = np.linalg.pinv(normal)
+    return np.asarray(np.sum((rows @ cofactor) * rows, axis=1))

@@ -1,0 +1,264 @@
+"""The residuals of a fit, pose by pose: leverage, studentised, as seen by the other poses, and which are outliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.calibration.distributions import student_chance
+from accelcal_cli.calibration.observability import ROWS_COLUMNS, design
+from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import NO_NOISE
+
+KEPT = 1000
+"""Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""
+
+KEPT_WORST = 20
+
+SUSPECT = 3.0
+"""Studentised residuals beyond this may be outliers: those of Student's t with any freedom are as large at least."""
+
+BENT = 0.01
+"""A residual beyond this part of g bends the fit so far that no first-order formula holds."""
+
+OUTLIER_LEVEL = 0.002
+"""Chance of naming an outlier among all poses where there is none (Bonferroni over the poses)."""
+
+STEPS, SETTLED = 12, 1e-6
+"""Gauss-Newton steps at most of a fit without a pose, and the part of g below which a step is the last: the next would
+be its square."""
+
+LEAST_ROOM = 1e-8
+"""The trace of a matrix times that of its inverse is below 1 over this where the other poses determine a sensor."""
+
+RIDGE = 1e-14
+"""Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResiduals:
+    """Residuals of k poses of each of R sensors.
+
+    Attributes:
+        pose: their numbers, from 0, shape (R, k); real: which are no repetitions, shape (R, k).
+        error, before: |f| - g after and before calibration, m/s^2, shape (R, k).
+        force: calibrated specific force, gauge `lower`, m/s^2, shape (R, k, 3).
+        leverage: part of the pose's own residual that the fit absorbs, shape (R, k).
+        studentised: residual over its standard deviation from the other poses, shape (R, k).
+        left_out: |f| - g, m/s^2, that a fit without the pose would show, shape (R, k).
+        outlier: whether the studentised residual is beyond chance, shape (R, k).
+    """
+
+    pose: Int
+    real: Bool
+    error: Float
+    before: Float
+    force: Float
+    leverage: Float
+    studentised: Float
+    left_out: Float
+    outlier: Bool
+
+
+def worst(columns: list[Float], sample: Sample) -> list[Float]:
+    """Return the columns of the poses that are kept: all of few; of many those with the largest residuals, in order."""
+    if int(sample.poses.max()) <= KEPT:
+        return columns
+    size = np.abs(columns[1])
+    last = min(KEPT_WORST, size.shape[1]) - 1
+    index = np.sort(np.argpartition(-size, last, axis=1)[:, :KEPT_WORST], axis=1)
+    rows = np.arange(len(size))[:, None]
+    return [column[rows, index] for column in columns]
+
+
+def length_error(e: Float, g: float) -> Float:
+    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
+    return np.asarray(np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g)
+
+
+def pose_residuals(
+    total: Float,
+    kept: list[Float],
+    sample: Sample,
+    cofactor: Float,
+    freedom: Int,
+    held: Bool | None,
+    rejected: Bool | None,
+    g: float,
+) -> PoseResiduals:
+    """Return the kept residuals with their leverage, studentised and with the pose left out, and the outliers."""
+    order, scaled, w, f, e_raw = kept
+    number = order.astype(np.intp)
+    real, free = number < sample.poses[:, None], freedom[:, None]
+    f = np.ascontiguousarray(f)
+    size = np.linalg.norm(f, axis=2)
+    leverage = leverages(design(f / np.where(size > 0, size, 1.0)[..., None]), w, cofactor)
+    room = room_of(leverage)
+    error, studentised = size - g, studentise(scaled, room, total[:, None], free)
+    left_out = error / room
+    sensor, pose = np.nonzero(is_suspect(studentised, error, free, g) & real & (w > 0))
+    if number.shape[1] < int(
+        sample.poses.max()
+    ):  # of so many poses none bends the fit, unless beyond all measure
+        blown = np.isnan(studentised[sensor, pose])
+        at = sensor[blown], pose[blown]
+        studentised[at] = np.copysign(np.inf, error[at])
+    elif len(sensor):
+        at = sensor, pose
+        studentised[at], left_out[at] = leave_out(f[sensor], w[sensor], pose, g, held)
+    beyond = beyond_chance(np.abs(studentised), sample.poses[:, None], free)
+    outlier = beyond & real & (np.abs(error) > NO_NOISE * g)
+    if rejected is not None:
+        _tell_rejected(
+            rejected, order.astype(np.intp), (f, error, cofactor, total, free), studentised, left_out
+        )
+        outlier |= np.take_along_axis(rejected, number, axis=1)
+    return PoseResiduals(
+        number, real, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
+    )
+
+
+def _tell_rejected(
+    rejected: Bool,
+    number: Int,
+    fit: tuple[Float, Float, Float, Float, Int],
+    studentised: Float,
+    left_out: Float,
+) -> None:
+    """Fill in how far off the poses are that the fit was made without.
+
+    Args:
+        rejected: which of all poses, shape (R, J); number: of those that are kept, shape (R, k).
+        fit: their specific force and |f| - g, the cofactor, the sum of squares and the degrees of freedom.
+        studentised, left_out: to fill in, shape (R, k).
+    """
+    f, error, cofactor, total, freedom = fit
+    rows = design(f / np.maximum(np.linalg.norm(f, axis=2, keepdims=True), 1e-300))
+    spread = 1.0 + np.sum((rows @ cofactor) * rows, axis=2)
+    deviation = np.sqrt(total[:, None] / np.maximum(freedom, 1) * spread)
+    out = np.take_along_axis(rejected, number, axis=1)
+    studentised[out], left_out[out] = (error / deviation)[out], error[out]
+
+
+def is_suspect(studentised: Float, error: Float, freedom: Int | int, g: float) -> Bool:
+    """Return which poses may be outliers, or bend the fit too far for the first-order formula, shape (..., J).
+
+    Args:
+        studentised: by that formula, NaN where it has nothing to say; error: |f| - g, m/s^2.
+        freedom: J - 9, a scalar or of shape (..., 1).
+    """
+    large = ~(np.abs(studentised) <= SUSPECT) & (np.abs(error) > NO_NOISE * g)
+    return np.asarray((large | (np.abs(error) > BENT * g)) & (np.asarray(freedom) >= 2))
+
+
+def leverages(rows: Float, w: Float, cofactor: Float) -> Float:
+    """Return the part of each pose's own residual that the fit absorbs, shape (..., J).
+
+    Args:
+        rows: their design, shape (..., J, 9); w: their weights, shape (..., J).
+        cofactor: (J^T W J)^-1, shape (..., 9, 9).
+    """
+    return np.asarray(np.minimum(w * np.sum((rows @ cofactor) * rows, axis=-1), 1.0))
+
+
+def room_of(leverage: Float) -> Float:
+    """Return 1 - leverage; NaN for a pose that the fit follows completely: it has no error to judge it by."""
+    return np.where(leverage < 1.0 - 1e-9, 1.0 - leverage, np.nan)
+
+
+def studentise(scaled: Float, room: Float, total: Float | float, freedom: Int | int) -> Float:
+    """Return residuals over their standard deviation from the other poses, shape (..., J), NaN below 2 of freedom.
+
+    Args:
+        scaled: sqrt(w) e, m/s^2, and `room`, both of shape (..., J).
+        total: the sum of all their squares; freedom: J - 9; both scalars or of shape (..., 1).
+    """
+    others = np.maximum(total - scaled**2 / room, 0.0) / np.maximum(freedom - 1, 1)
+    deviation = np.sqrt(np.where((others > 0) & (np.asarray(freedom) >= 2), others, np.nan) * room)
+    return np.asarray(-scaled / deviation)
+
+
+def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
+    """Return which studentised residuals are so large that none of a sensor's would be by chance (Student's t).
+
+    Args:
+        size: absolute values, shape (..., J), NaN for none; poses, freedom: of their sensor, broadcast to that shape.
+    """
+    beyond: Bool = np.zeros(size.shape, dtype=bool)
+    suspect = np.nonzero((size > SUSPECT) & (freedom >= 2))
+    poses, freedom = (np.broadcast_to(a, size.shape)[suspect] for a in (poses, freedom))
+    beyond[suspect] = poses * student_chance(size[suspect], freedom - 1) < OUTLIER_LEVEL
+    return beyond
+
+
+def leave_out(
+    force: Float, weights: Float, pose: Int, g: float, held: Bool | None = None
+) -> tuple[Float, Float]:
+    """Fit S sensors anew, each without one of its poses: what a pose looks like to the others.
+
+    The formula of linear regression subtracts a pose's part from the sum of squares. A pose that is wrong by several
+    per cent bends the fit so far that its part comes out larger than the whole, and the formula has nothing to say.
+
+    Args:
+        force: specific force by the fit with all poses, m/s^2, shape (S, J, 3).
+        weights: of the poses, 0 for none, shape (S, J).
+        pose: which one to leave out, shape (S,).
+        g: local gravity, m/s^2.
+        held: which of the nine parameters are not estimated, shape (9,).
+
+    Returns:
+        |f| - g of the pose left out over its standard deviation, from the residuals of the others, and |f| - g itself,
+        m/s^2, shape (S,) both; NaN where the others do not determine the sensor, or where too few are left.
+    """
+    free = np.arange(9) if held is None else np.flatnonzero(~held)
+    sensors = np.arange(len(pose))
+    kept = weights.copy()
+    kept[sensors, pose] = 0.0
+    with np.errstate(all="ignore"):
+        going = np.ones((len(pose), 1), dtype=bool)
+        for _ in range(STEPS):
+            e, rows, cofactor = _linearised(force, kept, g, free)
+            step = np.zeros((len(pose), 9))
+            step[:, free] = -(cofactor @ (rows.swapaxes(1, 2) @ (kept * e)[..., None]))[..., 0]
+            force = _moved(
+                force, np.where(going, step, 0.0), g
+            )  # each comes to the same point in any company
+            going &= (np.abs(step) > SETTLED * g).any(axis=1, keepdims=True)
+            if not going.any():
+                break
+        e, rows, cofactor = _linearised(force, kept, g, free)
+        freedom = np.count_nonzero(kept, axis=1) - len(free)
+        variance = np.sum(kept * e * e, axis=1) / np.where(freedom > 0, freedom, np.nan)
+        at = rows[sensors, pose]
+        spread = 1.0 / weights[sensors, pose] + np.sum((cofactor @ at[..., None])[..., 0] * at, axis=1)
+        error = np.linalg.norm(force[sensors, pose], axis=1) - g
+        return -e[sensors, pose] / np.sqrt(variance * spread), error
+
+
+def _linearised(force: Float, weights: Float, g: float, free: Int) -> tuple[Float, Float, Float]:
+    """Return e = (g^2 - |f|^2) / 2g, its derivatives by the changes of `_moved`, and the inverse of their products.
+
+    Shapes (S, J), (S, J, p) and (S, p, p) for the p parameters at `free`; NaN where the weighted poses do not determine
+    a sensor.
+    """
+    e = (g * g - np.sum(force * force, axis=2)) / (2.0 * g)
+    rows = design(force / g)[..., free]
+    normal = (rows * weights[..., None]).swapaxes(1, 2) @ rows
+    size = np.einsum("spp->s", normal)
+    finite = np.isfinite(size)[:, None, None]
+    inverse = np.linalg.inv(
+        np.where(finite, normal + RIDGE * size[:, None, None] * np.eye(len(free)), np.eye(len(free)))
+    )
+    spread = np.einsum("spp->s", inverse) * size
+    known = (spread > 0) & (spread < 1.0 / LEAST_ROOM)
+    return e, rows, np.where(known[:, None, None], inverse, np.nan)
+
+
+def _moved(force: Float, step: Float, g: float) -> Float:
+    """Return (I + E) f - b, with the lower triangle E (times g) and b from a step, m/s^2, shape (S, 9)."""
+    E = np.zeros((len(step), 3, 3))
+    for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+        E[:, i, j] = step[:, p] / g
+    return np.asarray(force + force @ E.swapaxes(1, 2) - step[:, None, 6:])

@@ -1,0 +1,333 @@
+"""Which rows of a table are read: those that meet conditions, that are no zeros of an idle logger, of one sensor.
+
+A `RowFilter` is what `--where COLUMN=VALUE` means. It goes before the parser: rows that do not meet the conditions are
+never parsed, so that they may hold what no reading may, and it remembers where the rows that stay came from, so that
+messages name the lines of the input. `ZeroRows` and `OneSensor` look at the rows that have been parsed.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import compress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.errors import DataError
+from accelcal_cli.io.columns import is_kind
+from accelcal_cli.io.dialect import BOM, MARKS, Dialect, is_blank, is_comment, split_cells
+from accelcal_cli.io.reader import InputTable, RowBlock
+from accelcal_cli.io.skipped import LineMap
+from accelcal_cli.notices import Notice
+
+if TYPE_CHECKING:
+    import polars as pl
+
+VALUES = 8
+"""Values of a column that a message shows at most."""
+
+SMALL = 1 << 18
+"""Bytes: a block up to this size does not need polars."""
+
+SHOWN = 6
+"""Rows, poses or values that a sentence names at most."""
+
+MOST_SENSORS = 1000
+"""A column with more values does not label sensors."""
+
+KIND_OF_SENSOR = re.compile(r"acc|gyr|mag|baro|imu|linear|gravity|rot|compass|temp", re.IGNORECASE)
+ACCELEROMETER = re.compile(r".*acc", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A column, counted from 0 and by name, and the value that a row must have there, as text."""
+
+    column: int
+    name: str
+    value: str
+
+    def holds(self, cell: str) -> bool:
+        """Return whether a cell has the value: as text, or as number."""
+        if cell == self.value:
+            return True
+        try:
+            return float(cell) == float(self.value)
+        except ValueError:
+            return False
+
+    def mask(self, cells: pl.Series) -> pl.Series:
+        """Return which cells have the value."""
+        import polars as pl
+
+        text = cells.cast(pl.String).str.strip_chars(" \t\r")
+        met = text == self.value
+        try:
+            number = float(self.value)
+        except ValueError:
+            return met.fill_null(False)
+        return (met | (text.cast(pl.Float64, strict=False) == number)).fill_null(False)
+
+
+@dataclass(eq=False)
+class RowFilter:
+    """Keeps the lines, or the rows of a frame, that meet all conditions.
+
+    Attributes:
+        source: named in messages; conditions: at least one.
+        lines: line, or row from 1, of the input for each one that stays, from 1.
+    """
+
+    source: str
+    conditions: Sequence[Condition]
+    lines: LineMap = field(default_factory=LineMap)
+    _seen: dict[str, None] = field(default_factory=dict)  # values of the first condition's column
+    _read: int = 0
+    _kept: int = 0
+    _met: bool = False
+
+    def keep_all(self, block: bytes) -> bytes:
+        """Keep the lines of the top of a table: its header and what is above."""
+        count = block.count(b"\n") + (not block.endswith(b"\n"))
+        self._note(np.arange(count), count)
+        return block
+
+    def keep(self, block: bytes, dialect: Dialect) -> bytes:
+        """Return the lines of a block of whole lines that meet the conditions, blank lines and comments left out."""
+        mask = self._fast(block, dialect) if len(block) > SMALL else None
+        if mask is None:
+            mask = np.array([self._meets(raw, dialect) for raw in io.BytesIO(block)], dtype=bool)
+        self._met |= bool(mask.any())
+        self._note(np.flatnonzero(mask), len(mask))
+        if mask.all():
+            return block
+        ends = np.flatnonzero(np.frombuffer(block, np.uint8) == ord("\n")) + 1
+        ends = ends if len(ends) == len(mask) else np.append(ends, len(block))
+        chosen = np.repeat(mask, np.diff(ends, prepend=0))
+        return np.frombuffer(block, np.uint8)[chosen].tobytes()
+
+    def rows(self, frame: pl.DataFrame) -> pl.DataFrame:
+        """Return the rows of a frame that meet the conditions."""
+        import polars as pl
+
+        met = pl.Series([True]).new_from_index(0, frame.height)
+        for condition in self.conditions:
+            met &= condition.mask(frame[condition.name])
+        mask = met.to_numpy()
+        self._see(frame[self.conditions[0].name])
+        self._met |= bool(mask.any())
+        self._note(np.flatnonzero(mask), len(mask))
+        return frame.filter(met)
+
+    def meets(self, cells: Sequence[str]) -> bool:
+        """Return whether a whole row meets the conditions."""
+        return all(condition.holds(cells[condition.column]) for condition in self.conditions)
+
+    def check(self) -> None:
+        """Raise DataError where no row has met the conditions; to be called at the end of the table."""
+        if self._met:
+            return
+        wanted = " and ".join(f'column "{c.name}" = {c.value}' for c in self.conditions)
+        values = list(self._seen)
+        held = ", ".join(values[:VALUES]) + (" and others" if len(values) > VALUES else "")
+        raise DataError(
+            f'{self.source}: no row has {wanted} (--where); column "{self.conditions[0].name}" holds {held}'
+        )
+
+    def _note(self, kept: Int, read: int) -> None:
+        """Note which of the next `read` lines stay."""
+        self.lines.add_many(self._kept + 1 + np.arange(len(kept)), self._read + 1 + kept)
+        self._kept += len(kept)
+        self._read += read
+
+    def _meets(self, raw: bytes, dialect: Dialect) -> bool:
+        """Return whether a line meets the conditions; one that is too short does, for the parser to find fault with."""
+        line = raw.removeprefix(BOM).decode(errors="replace")
+        if is_blank(line) or is_comment(line, dialect.marks):
+            return False
+        cells = split_cells(line.rstrip("\r\n"), dialect.separator)
+        if len(cells) <= max(condition.column for condition in self.conditions):
+            return True
+        if len(self._seen) <= VALUES:
+            self._seen[cells[self.conditions[0].column]] = None
+        return self.meets(cells)
+
+    def _fast(self, block: bytes, dialect: Dialect) -> Bool | None:
+        """Return which lines meet the conditions, None where polars may see other lines than are there."""
+        import polars as pl
+
+        odd = (
+            b'"' in block
+            or any(mark.encode() in block for mark in MARKS)
+            or (dialect.separator != ";" and b";" in block)
+            or dialect.separator == " "
+            or b"\n\n" in block
+            or b"\n\r\n" in block
+        )
+        if odd or block[:1] in b"\r\n" or not block.endswith(b"\n"):
+            return None
+        schema = {str(k): pl.String for k in range(dialect.width)}
+        try:
+            frame = pl.read_csv(
+                block,
+                has_header=False,
+                schema=schema,
+                separator=dialect.separator,
+                quote_char=None,
+                columns=sorted({condition.column for condition in self.conditions}),
+            )
+        except pl.exceptions.PolarsError:
+            return None
+        if len(frame) != block.count(b"\n"):
+            return None
+        self._see(frame[str(self.conditions[0].column)])
+        met = [condition.mask(frame[str(condition.column)]).to_numpy() for condition in self.conditions]
+        return np.asarray(np.logical_and.reduce(met))
+
+    def _see(self, cells: pl.Series) -> None:
+        if len(self._seen) <= VALUES:
+            self._seen.update(
+                dict.fromkeys(str(value) for value in cells.unique(maintain_order=True)[: VALUES + 1])
+            )
+
+
+class ZeroRows:
+    """Leaves out rows that are zero in all axes: idle sleep of a logger, or a bus that does not answer.
+
+    No pose reads so, unless the bias is 1 g; with known specific force, which may be none, they stay.
+
+    Attributes:
+        count: rows left out; stretches: first and last of each run of them, SHOWN at most.
+        rows: number of each row that stays.
+    """
+
+    def __init__(self) -> None:
+        """Start without rows."""
+        self.count, self.stretches = 0, list[tuple[int, int]]()
+        self.rows = LineMap()
+        self._kept = 0
+
+    def without(self, rows: RowBlock) -> RowBlock:
+        """Return a block, whose first three numbers are the output, without such rows."""
+        keep = self.keep(rows.numbers[:, :3], rows.start)
+        if keep is None:
+            return rows
+        texts = tuple(list(compress(text, keep.tolist())) for text in rows.texts)
+        return RowBlock(rows.start, rows.numbers[keep], texts)
+
+    def keep(self, output: Float, start: int) -> Bool | None:
+        """Return which rows stay, shape (B,), or None for all; output (B, 3), `start` the number of the first."""
+        if not len(output):
+            return None
+        zero = output[:, 0] == 0.0
+        if zero.any():
+            zero &= (output[:, 1] == 0.0) & (output[:, 2] == 0.0)
+        keep = ~zero
+        if not zero.any():
+            self.rows.add(self._kept, start)
+            self._kept += len(output)
+            return None
+        gone = np.flatnonzero(zero)
+        self.count += len(gone)
+        add_stretches(self.stretches, start + gone)
+        place = self._kept + np.cumsum(keep) - keep
+        for row in np.flatnonzero(keep & np.append(True, zero[:-1])).tolist():
+            self.rows.add(int(place[row]), start + row)
+        self._kept += int(np.count_nonzero(keep))
+        return np.asarray(keep)
+
+    def notices(self, where: Callable[[int], str], left: int) -> tuple[Notice, ...]:
+        """Return what to say of them; `where` names a row, `left` rows have stayed."""
+        return zero_rows(self.count, places(self.stretches, where), left)
+
+
+def zero_rows(count: int, named: str, left: int) -> tuple[Notice, ...]:
+    """Return what is said of `count` rows of zeros that were left out, where `left` others stay."""
+    if not count:
+        return ()
+    text = f"{count:,} row{'s are' if count > 1 else ' is'} zero in all three axes"
+    text += f" ({named})" if named else ""
+    if count < left:
+        return (Notice("zero-rows", "note", f"{text}: no accelerometer at rest reads so; left out."),)
+    return (
+        Notice(
+            "zero-rows",
+            "warning",
+            f"{text} and were left out; only {left:,} others remain.",
+            "Record again with idle sleep mode off, and check that --columns names the accelerometer.",
+        ),
+    )
+
+
+class OneSensor:
+    """Refuses a table whose rows are of several sensors, as a column of it says."""
+
+    def __init__(self, table: InputTable, columns: Sequence[int], *, fleet: bool) -> None:
+        """Watch the columns, which stand last among the texts of each block.
+
+        Args:
+            table: open; columns: counted from 0, whose values tell sensors apart.
+            fleet: whether the table may go to accelcal fleet.
+        """
+        self.table, self.fleet = table, fleet
+        self.values: dict[int, dict[str, None]] = {column: {} for column in columns}
+        self.rows = 0
+
+    def add(self, rows: RowBlock) -> None:
+        """Look at a block; DataError where a column has several values, each for many rows."""
+        self.rows += len(rows.numbers)
+        texts = rows.texts[len(rows.texts) - len(self.values) :]
+        for (column, values), cells in zip(self.values.items(), texts, strict=True):
+            if len(values) > MOST_SENSORS:
+                continue
+            values.update(dict.fromkeys(cells))
+            if 1 < len(values) <= self.rows / 2 and self._tells(column, list(values)):
+                raise DataError(self._refusal(column, list(values)))
+
+    def _tells(self, column: int, values: list[str]) -> bool:
+        """Return whether the values are sensors: those of a column of kinds are, where one is a kind of sensor."""
+        return not is_kind((self.table.names or ())[column]) or any(map(KIND_OF_SENSOR.match, values))
+
+    def _refusal(self, column: int, values: list[str]) -> str:
+        name = (self.table.names or ())[column]
+        best = next((value for value in values if ACCELEROMETER.match(value)), values[0])
+        shown = ", ".join(values[:SHOWN]) + (
+            f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
+        )
+        many = (
+            f", or calibrate each with accelcal fleet --sensor-column {shlex.quote(name)}"
+            if self.fleet
+            else ""
+        )
+        return (
+            f'{self.table.name}: column "{name}" has {len(values)} values ({shown}): these are readings of several '
+            f"sensors; choose one with --where {shlex.quote(f'{name}={best}')}{many}"
+        )
+
+
+def add_stretches(stretches: list[tuple[int, int]], rows: Int) -> None:
+    """Add runs of consecutive rows, ascending, to some stretches, of which the first SHOWN are kept."""
+    breaks = np.flatnonzero(np.diff(rows) > 1)
+    firsts, lasts = np.append(rows[:1], rows[breaks + 1]), np.append(rows[breaks], rows[-1:])
+    if stretches and stretches[-1][1] + 1 == firsts[0]:
+        stretches[-1] = stretches[-1][0], int(lasts[0])
+        firsts, lasts = firsts[1:], lasts[1:]
+    room = SHOWN - len(stretches)
+    stretches += zip(firsts[:room].tolist(), lasts[:room].tolist(), strict=True)
+
+
+def places(stretches: list[tuple[int, int]], where: Callable[[int], str]) -> str:
+    """Return how to name stretches of rows."""
+    shown = [where(a) if a == b else f"{where(a)} to {where(b)}" for a, b in stretches]
+    return ", ".join(shown) + (", ..." if len(shown) == SHOWN else "")
+
+
+def named(shown: list[str], count: int) -> str:
+    """Return names in a list, and how many more there are."""
+    more = count - len(shown)
+    return ", ".join(shown) + (f" and {more:,} more" if more > 0 else "")

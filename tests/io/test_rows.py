@@ -1,0 +1,128 @@
+"""`--where COLUMN=VALUE`: which rows are read, and that their lines keep their numbers."""
+
+import io
+
+import numpy as np
+import pytest
+
+from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.io.columns import restrict
+from accelcal_cli.io.reader import Selection, open_table
+from accelcal_cli.io.readings import read_readings
+
+TABLE = """# two sensors
+device,ax,ay,az
+0,1,2,3
+
+1,4,5,6
+# a comment
+0,7,8,9
+1,10,11,12
+"""
+
+
+def opened(text, *where):
+    table = open_table("-", io.BytesIO(text.encode()))
+    restrict(table, where)
+    return table
+
+
+def rows_of(table, columns=(1, 2, 3)):
+    blocks = list(table.blocks(Selection(columns)))
+    return np.concatenate([block.numbers for block in blocks])
+
+
+def test_rows_that_meet_a_condition_and_their_lines():
+    table = opened(TABLE, "device=1")
+    assert rows_of(table).tolist() == [[4, 5, 6], [10, 11, 12]]
+    assert [table.where(k) for k in range(2)] == ["line 5", "line 8"]
+
+
+def test_conditions_add_up_and_numbers_are_numbers():
+    assert rows_of(opened(TABLE, "device=0.0", "ax=7")).tolist() == [[7, 8, 9]]
+
+
+def test_a_table_without_a_header():
+    text = "\n".join(TABLE.splitlines()[2:]) + "\n"
+    assert rows_of(opened(text, "1=0")).tolist() == [[1, 2, 3], [7, 8, 9]]
+
+
+def test_a_bad_cell_of_another_sensor_does_not_matter_and_one_of_its_own_is_named():
+    text = "kind,x,y,z\nacc,1,2,3\ngps,,,\nacc,4,5,6\nacc,4,oops,6\n"
+    with pytest.raises(DataError, match=r'line 5, column "y": "oops"'):
+        rows_of(opened(text, "kind=acc"))
+    assert len(rows_of(opened(text.replace("oops", "5"), "kind=acc"))) == 3
+
+
+def test_a_value_that_no_row_has_is_named_with_those_that_are_there():
+    with pytest.raises(DataError, match=r'no row has column "device" = 7 .* holds 0, 1'):
+        rows_of(opened(TABLE, "device=7"))
+
+
+@pytest.mark.parametrize("text", ["device", "=3", "device=", "nothing=3"])
+def test_a_condition_that_is_none(text):
+    with pytest.raises(UsageError, match="--where"):
+        opened(TABLE, text)
+
+
+def test_long_tables_are_filtered_by_polars_alike(tmp_path):
+    """Beyond the head of a file whole blocks are filtered at once."""
+    rng = np.random.default_rng(1)
+    numbers = rng.integers(-9999, 9999, (60_000, 3))
+    device = rng.integers(0, 3, 60_000)
+    lines = [f"{d},{a},{b},{c}" for d, (a, b, c) in zip(device.tolist(), numbers.tolist(), strict=True)]
+    path = tmp_path / "long.csv"
+    path.write_text("\n".join(["device,ax,ay,az", *lines]) + "\n")
+    table = open_table(path)
+    restrict(table, ["device=2"])
+    kept = np.flatnonzero(device == 2)
+    assert np.array_equal(rows_of(table), numbers[kept])
+    table.close()
+    assert [table.where(k) for k in (0, 999, len(kept) - 1)] == [
+        f"line {kept[k] + 2}" for k in (0, 999, len(kept) - 1)
+    ]
+
+
+def test_parquet(tmp_path):
+    pl = pytest.importorskip("polars")
+    frame = pl.DataFrame({"device": ["a", "b", "a"], "ax": [1.0, 2.0, 3.0], "ay": [1.0] * 3, "az": [2.0] * 3})
+    frame.write_parquet(tmp_path / "log.parquet")
+    table = open_table(tmp_path / "log.parquet")
+    restrict(table, ["device=a"])
+    assert rows_of(table).tolist() == [[1, 1, 2], [3, 1, 2]]
+    table.close()
+    assert table.where(1) == "row 3"
+
+
+def two_sensors(tmp_path, header="device", values=("A 1", "B")):
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(24, 3))
+    text = [f"{header},ax,ay,az"] + [
+        ",".join([values[k % 2], *map(repr, row)]) for k, row in enumerate(rows.tolist())
+    ]
+    path = tmp_path / "two.csv"
+    path.write_text("\n".join(text) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("header", ["device", "sensor_id", "I", "imu", "instance", "serial"])
+def test_several_sensors_are_refused_with_a_way_out(tmp_path, header):
+    path = two_sensors(tmp_path, header)
+    with pytest.raises(
+        DataError, match=rf'column "{header}" has 2 values \(A 1, B\).*--where .{header}=A 1.'
+    ):
+        read_readings(path)
+    assert read_readings(path, where=[f"{header}=A 1"]).poses == 12
+
+
+def test_kinds_of_poses_are_no_sensors_and_kinds_of_sensors_are(tmp_path):
+    assert read_readings(two_sensors(tmp_path, "type", ("face", "edge"))).poses == 24
+    with pytest.raises(DataError, match="--where type=accelerometer"):
+        read_readings(two_sensors(tmp_path, "type", ("gyroscope", "accelerometer")))
+
+
+def test_a_number_of_its_own_for_each_row_is_no_sensor(tmp_path):
+    path = tmp_path / "sn.csv"
+    rows = np.random.default_rng(3).normal(size=(24, 3)).tolist()
+    path.write_text("sn,ax,ay,az\n" + "\n".join(f"{k},{a},{b},{c}" for k, (a, b, c) in enumerate(rows)))
+    assert read_readings(path).poses == 24
