@@ -35,6 +35,10 @@ FEWEST_THOUSANDS = 6
 """Cells such as 33,368 from which on they are thousands, where none says that the comma is a decimal mark."""
 
 
+class ThousandsError(DataError):
+    """Commas separate thousands; no other reading of the text helps."""
+
+
 @dataclass(frozen=True)
 class Dialect:
     """The form of a text table. `separator` " " stands for runs of blanks and tabs.
@@ -252,7 +256,7 @@ def _decimal_comma(lines: list[str], separator: str) -> bool:
 
 
 def _refuse_thousands(lines: list[str], separator: str, source: str) -> None:
-    """Raise DataError where commas separate thousands, as in 33,368, which a decimal comma would read as 33.368.
+    """Raise ThousandsError where commas separate thousands, as in 33,368, which a decimal comma would read as 33.368.
 
     Fractions of three digits are told from thousands by cells such as 0,012: no number with thousands begins so.
     """
@@ -261,7 +265,7 @@ def _refuse_thousands(lines: list[str], separator: str, source: str) -> None:
     if len(numbers) < FEWEST_THOUSANDS or not all(_THOUSANDS.fullmatch(cell) for cell in numbers):
         return
     shown = numbers[0]
-    raise DataError(
+    raise ThousandsError(
         f'{source}: "{shown}" has a thousands separator, it seems, as have all numbers with a comma: a decimal comma '
         f"would make it {shown.replace(',', '.', 1)}; save the table without thousands separators "
         f"({shown.replace(',', '')}), or, if the comma is a decimal mark, with decimal points"

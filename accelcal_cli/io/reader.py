@@ -25,6 +25,7 @@ from accelcal_cli.io.dialect import (
     MARKS,
     SAMPLE,
     Dialect,
+    ThousandsError,
     decode_line,
     is_blank,
     is_comment,
@@ -306,6 +307,8 @@ def _understand(source: ByteSource, options: ReadOptions) -> tuple[LineFilter | 
     if options.line is None:
         try:
             dialect = sniff(source.head, source.name, options.skip_rows)
+        except ThousandsError:
+            raise
         except DataError as problem:
             fault = problem
         if dialect is not None and not _is_worded(dialect):
