@@ -25,6 +25,7 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
+from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.calibration.weights import SURELY_TREMBLES
 from accelcal_cli.notices import Notice, Severity, are_serious
@@ -326,7 +327,8 @@ def _large_misalignment(angle: float) -> tuple[Notice, ...]:
 def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return a warning of residuals far below the noise that the scatter within the poses predicts."""
     ratio, chance = float(fit.spread.ratio[at]), float(fit.spread.p_less[at])
-    if not (ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at):
+    rounding_alone = not fit.s[at] > NO_NOISE * fit.settings.g
+    if not (ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at) or rounding_alone:
         return ()
     text = (
         f"The residuals are {ratio:.2g} times what the scatter within the poses predicts: readings of two sensors are "
@@ -338,7 +340,7 @@ def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
 
 def _noise_bias(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return what was done about the noise bias, and a warning where too much of it may remain."""
-    if not (fit.bias[at] > 0).any():
+    if not (fit.bias[at] > 0).any() or not np.isfinite(_sigma(fit)[at]).any():
         return ()
     noise = fit.s[at] / fit.settings.g
     sizes = fit.bias[at] / np.where(_sigma(fit)[at] > 0, _sigma(fit)[at], np.inf)
@@ -367,7 +369,8 @@ def _tremor(fit: Fit, at: int) -> tuple[Notice, ...]:
     angle, g = float(tremor.angle[at]), fit.settings.g
     counted = tremor.excess[at, : int(fit.sample.poses[at])]
     short = float(np.mean(counted)) / g**2
-    left = float(tremor.doubt[at]) / float(np.nanmin(_sigma(fit)[at, SCALE]))
+    least = np.nan_to_num(_sigma(fit)[at, SCALE], nan=np.inf).min()
+    left = float(tremor.doubt[at] / least)
     text = (
         f"The sensor trembled by {angle * 1e3:.2g} mrad within the poses, which shortens their mean by "
         f"{short * 1e6:,.0f} ppm; that is given back"

@@ -99,8 +99,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
     fit = assessment.fit
     settings, search, model = fit.settings, fit.search, ErrorModel(fit.K[at], fit.D[at])
-    noise = (float(fit.spread.ratio[at]), float(fit.spread.p_more[at]))
-    ratio, chance = (None if np.isnan(v) else v for v in noise)
+    ratio, chance = (_number(part[at]) for part in (fit.spread.ratio, fit.spread.p_more))
     return Calibration(
         K_a=model.K,
         D_a=model.D,
@@ -143,7 +142,12 @@ def record(assessment: Assessment, at: int) -> Calibration:
         notes=_notes(assessment, at),
         version=__version__,
         temperature=fit.temperature,
+        shared_noise=_number(np.sqrt(fit.spread.shared[at])),
     ).with_intervals(float(fit.coverage[at]))
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
 
 
 def _origin(readings: Readings) -> dict[str, object]:

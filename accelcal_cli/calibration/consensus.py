@@ -15,7 +15,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import student_chance
 from accelcal_cli.calibration.observability import ALIGNED, design
-from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.sample import NO_NOISE, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.rng import Purpose, Streams
 
@@ -37,6 +37,9 @@ LOOKED_AT = 2000
 LEVEL = 0.01
 """Chance of rejecting a pose where none is wrong (Bonferroni over the poses)."""
 
+OPEN = 1e-15
+"""Part of the trace of the information that stands for none."""
+
 TRIMMED = 0.607
 """Standard deviation of the smaller three quarters of normal residuals, over that of all."""
 
@@ -56,7 +59,7 @@ class Consensus:
 
 def consensus(sample: Sample, settings: Settings) -> Consensus | None:
     """Return the consensus of the poses of one sensor; None where they are too few for one, or have none."""
-    N = sample.output()[0]
+    N = sample.output()[0, : int(sample.poses[0])]
     columns = np.flatnonzero(~ALIGNED) if not settings.misalignment else np.arange(9)
     free = len(columns)
     if len(N) < free + SPARE + 1:
@@ -162,8 +165,7 @@ def _grown(x: Float, start: Int, columns: Int) -> tuple[Bool, float] | None:
         s = float(np.sqrt(np.sum(e[agreeing] ** 2) / (count - free))) / scale
         leverage = _leverage(x, y[0], agreeing, columns)
         room = np.where(agreeing, np.maximum(1.0 - leverage, 1e-9), 1.0 + leverage)
-        if s <= 0:
-            return agreeing, s
+        s = max(s, NO_NOISE)
         t = np.abs(e) / (s * np.sqrt(room))
         chance = student_chance(np.maximum(t, 1e-9), np.full(poses, max(count - free, 1)))
         grown = poses * chance >= LEVEL
@@ -184,5 +186,6 @@ def _leverage(x: Float, y: Float, agreeing: Bool, columns: Int) -> Float:
     f = (x - centre) @ np.linalg.cholesky(A)
     rows = design(f / np.linalg.norm(f, axis=1, keepdims=True))[:, columns]
     normal = rows[agreeing].T @ rows[agreeing]
-    cofactor = np.linalg.pinv(normal)
+    # What the agreeing rows leave open has a huge leverage: no row disagrees there.
+    cofactor = np.linalg.inv(normal + OPEN * np.trace(normal) * np.eye(len(columns)))
     return np.asarray(np.sum((rows @ cofactor) * rows, axis=1))

@@ -42,10 +42,12 @@ class Spread:
 
     Attributes:
         variance: s^2 of weight 1, (m/s^2)^2, shape (R,).
-        covariance: of the nine parameters, (m/s^2)^2, shape (R, 9, 9).
+        covariance: of the nine parameters, then of slopes that are fitted beside them, (m/s^2)^2, shape (R, q, q).
         freedom: degrees of freedom of the covariance, shape (R,), 0 where there is none.
         ratio: s over the noise expected from the scatter, NaN where nothing tells, shape (R,).
         p_more, p_less: p-values of so large and of so small a ratio, shape (R,).
+        shared: m^2 that poses share beside the noise of their readings, (m/s^2)^2, NaN where nothing tells it, shape
+            (R,).
     """
 
     variance: Float
@@ -54,13 +56,14 @@ class Spread:
     ratio: Float
     p_more: Float
     p_less: Float
+    shared: Float
 
 
 def plain_spread(variance: Float, cofactor: Float, freedom: Int) -> Spread:
-    """Return the spread of poses with the same noise: s^2, shape (R,), and (A^T W A)^-1, shape (R, 9, 9)."""
+    """Return the spread of poses with the same noise: s^2, shape (R,), and (A^T W A)^-1, shape (R, q, q)."""
     nothing = np.full(len(variance), np.nan)
     covariance = variance[:, None, None] * cofactor
-    return Spread(variance, covariance, np.maximum(freedom, 0).astype(float), nothing, nothing, nothing)
+    return Spread(variance, covariance, np.maximum(freedom, 0).astype(float), *(nothing,) * 4)
 
 
 def scattered_spread(
@@ -88,18 +91,28 @@ def scattered_spread(
     # What the residuals leave beyond the scatter is shared by the poses; what they lack is lacking everywhere.
     shared = np.maximum(total - expected, 0.0) / np.maximum(np.sum(w * room, axis=1), 1e-300)
     V = w * (np.where(told, shared, 0.0)[:, None] + np.minimum(square, 1.0)[:, None] * noise.variance)
-    B = (rows * (w * V)[..., None]).swapaxes(1, 2) @ rows
     own = np.where(freedom > 0, _satterthwaite(V, w, rows, cofactor, leverage), denominator)
     usable = told | (noise.known & (freedom == 0))
     mean = np.sum(v, axis=1) / np.maximum(np.count_nonzero(w, axis=1), 1)
     return Spread(
         np.where(usable & (freedom == 0), mean, plain.variance),
-        np.where(usable[:, None, None], (cofactor @ B @ cofactor)[:, :9, :9], plain.covariance),
+        np.where(usable[:, None, None], sandwich(rows, w, V, cofactor), plain.covariance),
         np.where(usable, own, plain.freedom),
         np.where(told, np.sqrt(square), np.nan),
         np.where(told, f_chance(square, n1, n2), np.nan),
         np.where(told, f_chance(1.0 / square, n2, n1), np.nan),
+        np.where(told, shared, np.nan),
     )
+
+
+def sandwich(rows: Float, w: Float, v: Float, cofactor: Float) -> Float:
+    """Return the covariance C A^T W V W A C of a fit whose sqrt(w) e have the variances v, shape (R, q, q).
+
+    Args:
+        rows: A, shape (R, J, q); w, v: shape (R, J); cofactor: C, shape (R, q, q).
+    """
+    B = (rows * (w * v)[..., None]).swapaxes(1, 2) @ rows
+    return np.asarray(cofactor @ B @ cofactor)
 
 
 def _satterthwaite(v: Float, w: Float, rows: Float, cofactor: Float, leverage: Float) -> Float:

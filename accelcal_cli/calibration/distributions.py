@@ -33,10 +33,10 @@ MOST_TERMS = 2000
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it (0: not known)."""
+    """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it, whole or not (0: not known)."""
 
     variance: float
-    freedom: int
+    freedom: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ def _beta_fraction(a: Float, b: Float, x: Float) -> Float:
     c = np.ones_like(x)
     d = 1.0 - (a + b) * x / (a + 1.0)
     d = 1.0 / np.where(np.abs(d) < SMALLEST, SMALLEST, d)
-    h = d
+    h, going = d, np.ones(x.shape, dtype=bool)
     for m in range(1, FRACTIONS):
         for term in (
             m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
@@ -215,9 +215,10 @@ def _beta_fraction(a: Float, b: Float, x: Float) -> Float:
             d = 1.0 / np.where(np.abs(d) < SMALLEST, SMALLEST, d)
             c = 1.0 + term / c
             c = np.where(np.abs(c) < SMALLEST, SMALLEST, c)
-            step = c * d
+            step = np.where(going, c * d, 1.0)  # each comes to the same value in any company
             h = h * step
-        if (np.abs(step - 1.0) < 1e-15).all():
+        going = np.abs(step - 1.0) >= 1e-15
+        if not going.any():
             break
     return np.asarray(front * h)
 
@@ -252,6 +253,37 @@ def student_quantile(probability: float, freedom: float) -> float:
         if abs(step) <= 1e-13 * angle:
             break
     return math.sqrt(freedom) * math.tan(angle)
+
+
+MOST_STUDENT = 1e9
+"""Degrees of freedom from which on Student's t is the normal distribution to nine digits."""
+
+
+def student_freedom(probability: float, value: float) -> float:
+    """Return the degrees of freedom with which Student's t stays below a value with a probability.
+
+    The inverse of `student_quantile` in its other argument: at least 1, at most MOST_STUDENT.
+
+    Args:
+        probability: above 0.5; value: above the quantile of the normal distribution.
+    """
+    # The quantile is nearly straight in 1 / n: false position, its idle end halved.
+    ends = [1.0 / MOST_STUDENT, 1.0]
+    miss = [student_quantile(probability, 1.0 / x) - value for x in ends]
+    if miss[0] >= 0 or miss[1] <= 0:
+        return MOST_STUDENT if miss[0] >= 0 else 1.0
+    kept = 2
+    for _ in range(60):
+        x = ends[0] - miss[0] * (ends[1] - ends[0]) / (miss[1] - miss[0])
+        off = student_quantile(probability, 1.0 / x) - value
+        if abs(off) <= 1e-12 * value:
+            break
+        side = int(off > 0)
+        ends[side], miss[side] = x, off
+        if side == kept:
+            miss[1 - side] *= 0.5
+        kept = side
+    return 1.0 / x
 
 
 def _cosine_power(angle: Float, power: float) -> Float:

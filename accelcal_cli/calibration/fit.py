@@ -33,8 +33,8 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, length_error, pose_residuals, worst
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.sample import Sample, loss_slope, loss_weight
-from accelcal_cli.calibration.search import NO_NOISE, SLOPES, Search, Solution
+from accelcal_cli.calibration.sample import NO_NOISE, Sample, loss_slope, loss_weight
+from accelcal_cli.calibration.search import SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.weights import directions
 from accelcal_cli.sensor.model import Gauge, to_gauge
@@ -117,7 +117,8 @@ class Fit:
         """The slopes with temperature, where there are any, with their intervals; of one sensor."""
         if self.solution is None or self.solution.slopes is None:
             return None
-        return self.solution.slopes.temperature.with_intervals(float(self.coverage[0]))
+        slopes = self.solution.slopes.with_covariance(self.spread.covariance[0])
+        return slopes.with_intervals(float(self.coverage[0]))
 
 
 def coverage_of(freedom: Float) -> Float:
@@ -241,6 +242,8 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     sigma = np.sqrt(variance[:, None] * np.einsum("rpp->rp", cofactor))
     with np.errstate(divide="ignore", invalid="ignore"):
         notable = (np.abs(bias) > NOTABLE_BIAS * sigma).any(axis=1) & (np.abs(bias) < 0.1 * g).all(axis=1)
+        notable &= variance > (NO_NOISE * g) ** 2
+        notable &= ~_at_wall(solution.x).any(axis=1)
     if not notable.any():
         return point
     taken = np.where(notable[:, None], bias, 0.0)
@@ -261,22 +264,24 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[Spread, Int
     """Return noise and covariance, and into how many clusters rows that follow each other are summed (0: none)."""
     sample, stated = solution.sample, solution.stated
     cofactor, freedom = point.observability.cofactor, point.freedom
+    if solution.slopes is not None:
+        whole = np.zeros((1, 9 + SLOPES, 9 + SLOPES))
+        whole[:, :9, :9], whole[:, 9:, 9:] = cofactor, solution.slopes.cofactor
+        cofactor = whole
     spread = plain_spread(_variance(solution, sums, freedom), cofactor, freedom)
     clusters = np.zeros(len(sample), dtype=np.intp)
     if stated.noise is not None and solution.noise is None:
         u = directions(sample, point.lower, point.D)
         w = sample.real(0, u.shape[1]).astype(float) if stated.weights is None else stated.weights
-        rows, whole = design(u), cofactor
-        if solution.slopes is not None:
-            rows, whole = solution.slopes.rows, np.zeros((1, 9 + SLOPES, 9 + SLOPES))
-            whole[:, :9, :9], whole[:, 9:, 9:] = cofactor, solution.slopes.cofactor
-        spread = scattered_spread(spread, rows, w, whole, stated.noise, freedom)
+        rows = design(u) if solution.slopes is None else solution.slopes.rows
+        spread = scattered_spread(spread, rows, w, cofactor, stated.noise, freedom)
         if stated.own is not None:
             spread = _by_own(spread, stated.own, stated.noise.freedom(np.ones_like(w)))
     for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses)).tolist():
         one = _clusters(solution, point, at)
-        covariance, own, clusters[at] = one.spread(cofactor[at])
-        spread.covariance[at], spread.freedom[at] = covariance, own
+        covariance, own, clusters[at] = one.spread(cofactor[at, :9, :9])
+        spread.covariance[at, :9, 9:], spread.covariance[at, 9:, :9] = 0.0, 0.0
+        spread.covariance[at, :9, :9], spread.freedom[at] = covariance, own
     return spread, clusters
 
 
@@ -333,7 +338,9 @@ def _geometry(
         attitudes = np.where(sample.labelled, sample.poses, attitudes)
     loss = None if slopes is None else slopes.loss * (attitudes / sample.poses)[:, None, None]
     once = once if loss is None else once - loss
-    alike = (attitudes == sample.poses) & (solution.stated.weights is None)
+    alike = attitudes == sample.poses
+    if solution.stated.settings.weights != "none" or solution.stated.rejected is not None:
+        alike = np.zeros_like(alike)
     return Geometry.of(np.where(alike[:, None, None], information, once), attitudes, held)
 
 
@@ -482,7 +489,7 @@ def _covariance(
     """
     held = firm(observability.dop, verdicts, np.sqrt(spread.variance), g) & ~walled[:, None]
     held &= (spread.freedom > 0)[:, None]
-    return np.where(held[:, :, None] & held[:, None], spread.covariance, np.nan)
+    return np.where(held[:, :, None] & held[:, None], spread.covariance[:, :9, :9], np.nan)
 
 
 def firm(dop: Float, verdict: Sequence[PoseVerdict], s: Float, g: float) -> Bool:

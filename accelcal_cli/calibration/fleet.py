@@ -24,8 +24,7 @@ from accelcal_cli.calibration.observability import (
     propagated,
 )
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.calibration.sample import NORMAL_MAD, Sample
-from accelcal_cli.calibration.search import NO_NOISE
+from accelcal_cli.calibration.sample import NO_NOISE, NORMAL_MAD, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.fleet import FleetReadings

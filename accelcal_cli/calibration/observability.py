@@ -244,7 +244,7 @@ def poses_to_add(information: Float, poses: int, *, aligned: bool) -> tuple[str,
     """
     candidates = faces() if aligned else fixture_directions()
     known = knowing(information, ALIGNED) if aligned else information
-    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES - poses)
+    chosen = next_poses(known, candidates, MOST_SUGGESTIONS, COMFORTABLE, FEWEST_POSES + 1 - poses)
     return tuple(dict.fromkeys(describe(candidates[i]) for i in chosen))
 
 
@@ -339,7 +339,10 @@ def engineering_chain(lower: Float, D: Float, g: float) -> Float:
             cosine = np.sum(rows[..., i, :] * rows[..., j, :], axis=-1)
             turn = -(rows[..., i, a] * rows[..., j, b] + rows[..., i, b] * rows[..., j, a]) / g
             turn -= cosine * (scale[..., i] + scale[..., j])
-            change[..., 3 + q, p] = turn / np.sqrt(1.0 - cosine**2)
+            with np.errstate(
+                divide="ignore", invalid="ignore"
+            ):  # two axes that are one have no angle to turn
+                change[..., 3 + q, p] = turn / np.sqrt(1.0 - cosine**2)
         change[..., 6:, p] = -D / s * scale
     for i in range(3):
         change[..., 6 + i, 6 + i] = lower[..., i, i] / s[..., i]

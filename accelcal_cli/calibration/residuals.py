@@ -9,8 +9,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import student_chance
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design
-from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import NO_NOISE
+from accelcal_cli.calibration.sample import NO_NOISE, Sample
 
 KEPT = 1000
 """Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""

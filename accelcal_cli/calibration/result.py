@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.calibration.distributions import student_quantile
+from accelcal_cli.calibration.distributions import student_freedom, student_quantile
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     BIAS,
@@ -74,6 +74,8 @@ class Temperature:
         sigma_scale, sigma_bias: their one-sigma, shape (3,).
         interval_scale, interval_bias: half-widths of their 95 % intervals, shape (3,).
         dop: dilution of precision of the slopes, taken as force at half the range, shape (6,).
+        covariance: of the nine parameters and the six slopes, all as force, (m/s^2)^2, shape (15, 15); NaN in files of
+            earlier versions.
     """
 
     reference: float
@@ -86,6 +88,9 @@ class Temperature:
     interval_scale: MaybeVector
     interval_bias: MaybeVector
     dop: Annotated[Float, array(6, none=math.nan)]
+    covariance: Annotated[Float, array(15, 15, none=math.nan)] = field(
+        default_factory=lambda: np.full((15, 15), np.nan)
+    )
 
     def with_intervals(self, factor: float) -> Temperature:
         """Return the same slopes with the intervals of a coverage factor, NaN for none."""
@@ -191,6 +196,8 @@ class Calibration:
         residual_noise_ratio, residual_noise_p: s over the noise expected from the scatter within the poses, and the
             p-value of that ratio; None where the readings do not tell.
         covariance: of the nine parameters in gauge `lower`, (m/s^2)^2, shape (9, 9); NaN where they have no sigma.
+        shared_noise: standard deviation that the poses share beside the noise of their readings, m/s^2; None where
+            their scatter is not known.
         information: J^T J of the nine parameters, shape (9, 9): what the poses say of them; never without a number.
         nominal_scale, nominal_bias: what the engineering view is relative to, output units per m/s^2 and output
             units, shape (3,): the stated nominal sensor, or round numbers and no bias.
@@ -251,6 +258,12 @@ class Calibration:
     schema: str = SCHEMA
     temperature: Temperature | None = None
     coverage_factor: float | None = None
+    shared_noise: float | None = None
+
+    @property
+    def sigma_freedom(self) -> float:
+        """Degrees of freedom of sigma, whole or not, by its coverage factor; 0 without one."""
+        return 0.0 if self.coverage_factor is None else student_freedom(0.975, self.coverage_factor)
 
     @property
     def model(self) -> ErrorModel:

@@ -32,6 +32,10 @@ NEEDS = {
 HUBER = 1.345
 """Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
 
+NO_NOISE = 1e-9
+"""Residuals, or their standard deviation, below this part of g are rounding: readings are seldom written with ten
+digits, and no accelerometer is as quiet."""
+
 NORMAL_MAD = 1.4826
 """Standard deviation of normal noise over its median absolute deviation."""
 

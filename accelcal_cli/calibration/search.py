@@ -17,10 +17,11 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.consensus import consensus
 from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.sample import NO_NOISE, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.calibration.weights import (
+    MOST_TREMOR,
     SURELY_TREMBLES,
     PoseNoise,
     Tremor,
@@ -35,10 +36,6 @@ SAME_MINIMUM = 1e-6
 
 ROUNDING = 1e-26
 """A cost per reading, in units of g^4, below which only rounding is left."""
-
-NO_NOISE = 1e-9
-"""Residuals, or their standard deviation, below this part of g are rounding: readings are seldom written with ten
-digits, and no accelerometer is as quiet."""
 
 REWEIGHTINGS, SETTLED = 50, 1e-9
 """Robust rounds at most, about ten are the rule; and the step, in half-widths of the box, that ends them."""
@@ -116,6 +113,8 @@ class Slopes:
         sensor: K, gauge `lower`, and D at the reference temperature, shapes (R, 3, 3) and (R, 3).
         rows: the design of the nine parameters without what the slopes take, and of the slopes, shape (R, J, 15).
         cofactor: of the slopes, shape (R, 6, 6).
+        part: what the slopes' columns hold of those of the nine, shape (6, 9).
+        units: of the slopes, per degree, in one m/s^2 at half the range of temperature, shape (6,).
     """
 
     temperature: Temperature
@@ -123,6 +122,19 @@ class Slopes:
     sensor: tuple[Float, Float]
     rows: Float
     cofactor: Float
+    part: Float
+    units: Float
+
+    def with_covariance(self, covariance: Float) -> Temperature:
+        """Return the slopes with their sigma and the covariance of all fifteen, from that which belongs to `rows`.
+
+        `covariance`: of the nine parameters and of slopes + part @ nine, (m/s^2)^2, shape (15, 15).
+        """
+        back = np.eye(9 + SLOPES)
+        back[9:, :9] = -self.part
+        joint = back @ covariance @ back.T
+        scale, bias = np.split(np.sqrt(np.diagonal(joint)[9:]) * self.units, 2)
+        return replace(self.temperature, covariance=joint, sigma_scale=scale, sigma_bias=bias)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +216,10 @@ def _with_noise(stated: Stated) -> Stated:
     sample, g = stated.sample, stated.settings.g
     K, D = first_sensors(stated.cost)
     trembling = tremor(sample, K, D, g)
+    if trembling is not None:
+        # Directions by a sphere, where the poses fix no ellipsoid, do not tell along from across.
+        poor = np.array([source == "sphere" for source in stated.sources]) | (trembling.angle > MOST_TREMOR)
+        trembling = replace(trembling, certainty=np.where(poor, 0.0, trembling.certainty))
     if trembling is not None and (trembling.certainty > SURELY_TREMBLES).any():
         shakes = (trembling.certainty > SURELY_TREMBLES)[:, None]
         longer = directions(sample, K, D) * np.where(shakes, trembling.excess / g, 0.0)[..., None]

@@ -137,19 +137,18 @@ def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
         p = p + step
         if np.abs(step).max() <= SETTLED * g:
             break
-    s = float(np.sqrt((root * e) @ (root * e) / max(np.count_nonzero(root) - 9 - SLOPES, 1)))
     units = np.repeat([1.0 / g, 1.0], 3) * np.concatenate([np.ones(3), np.diagonal(low.K)]) / half
-    (scale, bias), (sigma_scale, sigma_bias) = np.split(p[9:] * units, 2), np.split(s * dop * units, 2)
+    (scale, bias), nothing = np.split(p[9:] * units, 2), np.full(3, np.nan)
     temperature = Temperature(
         reference=middle,
         low=float(degrees.min()),
         high=float(degrees.max()),
         scale=scale,
         bias=bias,
-        sigma_scale=sigma_scale,
-        sigma_bias=sigma_bias,
-        interval_scale=np.full(3, np.nan),  # the fit knows their factor
-        interval_bias=np.full(3, np.nan),
+        sigma_scale=nothing,  # the fit knows their noise
+        sigma_bias=nothing,
+        interval_scale=nothing,
+        interval_bias=nothing,
         dop=dop,
     )
     B, C = information[:9, 9:], information[9:, 9:]
@@ -159,8 +158,22 @@ def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
     # What the slopes' columns take from those of the nine parameters does not determine these.
     rows = np.column_stack([J[:, :9] - J[:, 9:] @ part, J[:, 9:]])
     found = sensor.K[None], sensor.D[None]
-    slopes = Slopes(temperature, (B @ part)[None], found, rows[None], np.linalg.inv(C)[None])
+    loss, cofactor = (B @ part)[None], np.linalg.inv(C)[None]
+    slopes = Slopes(temperature, loss, found, rows[None], cofactor, part, units)
     return slopes, sample.with_output(brought[None])
+
+
+def slope_rows(output: Float, degrees: Float, slopes: Temperature, sensor: ErrorModel, g: float) -> Float:
+    """Return d e / d slopes of readings, e = (g^2 - |f|^2) / 2g, slopes as force at half the range, shape (J, 6).
+
+    Args:
+        output: readings at their own temperatures, shape (J, 3); degrees: these, shape (J,).
+        slopes: of the sensor; sensor: at the reference temperature, gauge `lower`; g: m/s^2.
+    """
+    half = 0.5 * (slopes.high - slopes.low)
+    p = np.concatenate([np.zeros(9), g * half * slopes.scale, half * slopes.bias / np.diagonal(sensor.K)])
+    _, J = _linearised(output, (degrees - slopes.reference) / half, sensor, p, g)
+    return -J[:, 9:]
 
 
 def _unsuitable(solution: Solution, degrees: Float) -> str:

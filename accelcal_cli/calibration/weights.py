@@ -26,6 +26,9 @@ SMALLEST_RATIO = 0.01
 MOST_PRIOR = 1e6
 """Degrees of freedom of the pooled covariance in a pose from which on the poses are alike."""
 
+MOST_TREMOR = 0.3
+"""Tremor, rad rms, beyond which a sensor is turned rather than held."""
+
 SURELY_TREMBLES = 4.0
 """Standard deviations of the tangential excess beyond which a hand trembles: by chance 1 in 30 000."""
 
@@ -78,14 +81,14 @@ def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None)
     along, expected = np.einsum("rja,rjab,rjb->rj", u, S, u), np.einsum("rja,rab,rjb->rj", u, pooled, u)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where((own > 0) & (expected > 0), along / expected, 1.0)
-    prior = _prior(np.maximum(ratio, SMALLEST_RATIO), own)
-    weight = (prior[:, None] + own * ratio) / (prior[:, None] + own)
+    prior, middle = (part[:, None] for part in _prior(np.maximum(ratio, SMALLEST_RATIO), own))
+    weight = (prior * middle + own * ratio) / (prior + own)
     count = np.where(real & np.isfinite(sample.count), sample.count, 1.0)
     scale = np.where(real, weight / count, 0.0)
     known: Bool = np.asarray((np.isfinite(sample.count) | ~real).all(axis=1) & (own.sum(axis=1) > 0))
     if shakes is not None:
         known &= (entries_of(sample)[:, 0, 0, 1] > 0) | (shakes.certainty <= SURELY_TREMBLES)
-    return PoseNoise(expected * scale, pooled[:, None] * scale[..., None, None], own, prior, known)
+    return PoseNoise(expected * scale, pooled[:, None] * scale[..., None, None], own, prior[:, 0], known)
 
 
 def _covariances(sample: Sample, K: Float) -> tuple[Float, Float, Bool]:
@@ -119,22 +122,25 @@ def directions(sample: Sample, K: Float, D: Float) -> Float:
     return np.asarray(f / np.maximum(np.linalg.norm(f, axis=2, keepdims=True), 1e-300))
 
 
-def _prior(ratio: Float, own: Float) -> Float:
-    """Return the degrees of freedom that the pooled variance has in each pose, shape (R,) [smyth2004] section 6.2.
+def _prior(ratio: Float, own: Float) -> tuple[Float, Float]:
+    """Return how many degrees of freedom the usual variance has in each pose, and its ratio to the pooled one, (R,).
 
-    The logarithm of a variance with n degrees of freedom scatters by psi'(n / 2); what it scatters beyond that is
-    psi'(prior / 2).
+    [smyth2004] section 6.2: the logarithm of a variance with n degrees of freedom scatters by psi'(n / 2); what it
+    scatters beyond that is psi'(prior / 2).
     """
     told = own > 0
     half = np.where(told, 0.5 * own, 1.0)
     centred = np.where(told, np.log(ratio) - _digamma(half) + np.log(half), 0.0)
     poses = np.maximum(told.sum(axis=1), 1)
-    centred = np.where(told, centred - (centred.sum(axis=1) / poses)[:, None], 0.0)
+    middle = centred.sum(axis=1) / poses
+    centred = np.where(told, centred - middle[:, None], 0.0)
     excess = np.sum(centred**2, axis=1) / np.maximum(poses - 1, 1)
     excess = excess - np.sum(np.where(told, _trigamma(half), 0.0), axis=1) / poses
     alike = (excess <= 0) | (poses < FEWEST_ALIKE)
     prior = 2.0 * _inverse_trigamma(np.where(alike, 1.0, excess))
-    return np.where(alike, MOST_PRIOR, np.minimum(prior, MOST_PRIOR))
+    prior = np.where(alike, MOST_PRIOR, np.minimum(prior, MOST_PRIOR))
+    middle = np.exp(middle + _digamma(0.5 * prior) - np.log(0.5 * prior))
+    return prior, np.where(alike, 1.0, middle)
 
 
 def _digamma(x: Float) -> Float:
@@ -178,8 +184,8 @@ def alike_weights(sample: Sample) -> Float:
     pooled = np.einsum("rj,rja->ra", own, square) / np.maximum(own.sum(axis=1), 1.0)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(own > 0, np.nanmean(square / pooled[:, None], axis=2), 1.0)
-    prior = _prior(np.maximum(ratio, SMALLEST_RATIO), 3.0 * own)[:, None]
-    return sample.normalised(sample.count * (prior + 3.0 * own) / (prior + 3.0 * own * ratio))
+    prior, middle = (part[:, None] for part in _prior(np.maximum(ratio, SMALLEST_RATIO), 3.0 * own))
+    return sample.normalised(sample.count * (prior + 3.0 * own) / (prior * middle + 3.0 * own * ratio))
 
 
 @dataclass(frozen=True, eq=False)

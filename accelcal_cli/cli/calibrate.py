@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
 
-FACES = 6
-"""Fewest poses of a log without --min-poses when no misalignment is asked for."""
 SUFFIXES = (".yaml", ".yml", ".json")
 """Endings of a result file; they choose its form."""
 
@@ -142,18 +140,18 @@ def command(
     options.check_files([data, config], {"-o": output})
     _check_output(output, format)
     stated_g = gravity.stated()
-    detection = options.stated(**vars(log))
-    if detection and not raw:
-        raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
+    log.check_raw(raw)
     stated = options.stated(**vars(model), **vars(search), g=stated_g)
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)
     if raw:
-        if log.min_poses is None and not settings.misalignment:
-            log = replace(log, min_poses=FACES)
-        readings = log.detect(
-            data, columns, lambda unit: local_g(settings, gravity, config, unit), form
-        ).readings()
+        readings = log.poses(
+            data,
+            columns,
+            lambda unit: local_g(settings, gravity, config, unit),
+            form,
+            misalignment=settings.misalignment,
+        )
     else:
         readings = read_readings(
             data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()

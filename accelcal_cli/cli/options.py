@@ -12,7 +12,7 @@ import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
     from accelcal_cli.io.reader import ReadOptions
+    from accelcal_cli.io.readings import Readings
     from accelcal_cli.notices import Notice
     from accelcal_cli.views.blocks import Block, Table
 
@@ -266,6 +267,9 @@ LARGEST_RATE = 1e6
 LARGEST_MERGE, LARGEST_THIN = 5.0, 90.0
 """Degrees: the mean of poses that differ more is shorter than gravity by over a thousandth of it."""
 
+FACES = 6
+"""Fewest poses of a log without --min-poses when no misalignment is asked for."""
+
 in_log = panel("Raw log")
 
 
@@ -334,6 +338,31 @@ class DetectionOptions:
         int | None,
         in_log(help="Attitudes, 5 degrees apart, that must be found.", show_default="12", min=2),
     ] = None
+
+    def check_raw(self, raw: bool) -> None:
+        """Refuse options of a log where the file is none: raise UsageError."""
+        detection = stated(**vars(self))
+        if detection and not raw:
+            raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
+
+    def poses(
+        self,
+        data: str,
+        columns: str | None,
+        gravity: Callable[[str | None], float],
+        form: TextOptions,
+        *,
+        misalignment: bool,
+    ) -> Readings:
+        """Return the static poses of a raw log; faces are enough of them where no misalignment is asked for.
+
+        Args:
+            data, columns, gravity, form: see `detect`.
+            misalignment: whether misalignments are to be estimated.
+        """
+        few = self.min_poses is None and not misalignment
+        own = replace(self, min_poses=FACES) if few else self
+        return own.detect(data, columns, gravity, form).readings()
 
     def detect(
         self,

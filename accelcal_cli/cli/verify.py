@@ -15,6 +15,7 @@ in_test = options.panel("Test")
 
 
 def command(
+    *,
     result: options.ResultFile,
     data: Annotated[
         str,
@@ -22,8 +23,13 @@ def command(
             help="New static readings of the sensor; - is standard input.", rich_help_panel="Input"
         ),
     ],
-    form: options.TextOptions,
     columns: options.Columns = None,
+    form: options.TextOptions,
+    raw: Annotated[
+        bool,
+        options.in_log("--raw", help="The file is a raw log: find its static poses first, as detect does."),
+    ] = False,
+    log: options.DetectionOptions,
     g: Annotated[
         float | None,
         options.in_input(help="Local gravity; must be that of the result.", show_default="the result's"),
@@ -46,10 +52,11 @@ def command(
     that --tolerance was missed.
     """
     from accelcal_cli.io.readings import read_readings
-    from accelcal_cli.verification import verify
+    from accelcal_cli.verification.verify import verify
     from accelcal_cli.views.verification import blocks, differences
 
     options.check_input(data)
+    log.check_raw(raw)
     if not 0 < level < 1:
         raise UsageError(f"--level {level:g}: expected a chance between 0 and 1")
     old = options.load_result(result, data)
@@ -57,9 +64,12 @@ def command(
         raise UsageError(
             f"--g {g:g}: {result} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
         )
-    readings = read_readings(
-        data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
-    )
+    if raw:
+        readings = log.poses(data, columns, lambda _: old.g, form, misalignment=not old.held.any())
+    else:
+        readings = read_readings(
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
+        )
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():
         options.print_result(

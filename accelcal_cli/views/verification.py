@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.sensor import model as units
-from accelcal_cli.verification import Difference, Verification
+from accelcal_cli.verification.verify import Difference, Verification
 from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Table
 
 UNITS = ((-units.PPM, "ppm"), (-1000.0 * units.MRAD, "micro-rad"), (units.MICRO_G, "micro-g"))

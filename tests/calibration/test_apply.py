@@ -57,7 +57,10 @@ def test_the_covariance_of_twelve_is_that_of_the_linear_fit():
         Settings(g=G, attitudes="known"),
     )
     F = np.column_stack([u / G, np.ones(len(u))])
-    expected = np.kron(np.eye(3), result.s**2 * np.linalg.inv(F.T @ F))
+    N = MEMS.output(u + noise(24, 5e-3, 1))
+    left = N - u @ result.K_a.T - result.D_a
+    axes = np.linalg.solve(result.K_a, np.diag(np.sqrt((left**2).sum(axis=0) / 20)))
+    expected = np.kron(axes @ axes.T, np.linalg.inv(F.T @ F))
     np.testing.assert_allclose(covariance_of_twelve(result), expected, rtol=1e-9, atol=1e-9 * expected.max())
 
 

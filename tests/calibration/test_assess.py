@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -81,8 +80,8 @@ def test_noise_that_moves_the_scale_factors_is_told():
     u = noise(16_000, 1.0, 3)
     u /= np.linalg.norm(u, axis=1)[:, None]
     result = calibrate(readings(u, sigma=0.5), FAST)
-    assert any(_said(result, "0.9% too large"))
-    assert not any(_said(calibrate(readings(poses.turns(), sigma=0.02), FAST), "too large"))
+    assert any(_said(result, "of g in each reading biases the parameters"))
+    assert not any(_said(calibrate(readings(poses.turns(), sigma=0.02), FAST), "biases"))
 
 
 def test_warnings_of_readings_come_first_and_make_a_result_suspect():
@@ -211,16 +210,16 @@ def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio
     assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
 
 
-@pytest.mark.parametrize("part", [0.05, 0.1])
-def test_the_bias_that_is_stated_is_the_one_of_the_scale_factors(part):
-    """Noise of one sample a pose, in 40 000 poses: what it adds to the scale factors is measured."""
+@pytest.mark.parametrize("part", [0.01, 0.03])
+def test_the_noise_bias_is_taken_off(part):
+    """Noise of one sample a pose, in 40 000 poses: without the correction scale factors are 3.5 part^2 too large."""
     u = noise(40_000, 1.0, 3)
     u /= np.linalg.norm(u, axis=1)[:, None]
     result = calibrate(readings(u, sigma=part * G), FAST)
     (notice,) = [notice for notice in result.warnings if notice.key == "noise-bias"]
-    stated = float(re.search(r"about ([\d.]+)% too large", notice.text)[1])
-    measured = 100 * np.mean(np.diagonal(result.K_a) / np.diagonal(DPSO.in_gauge("lower").K) - 1.0)
-    assert stated == pytest.approx(measured, abs=0.05 + 0.06 * measured)
+    assert notice.severity == "warning"
+    left = np.mean(np.diagonal(result.K_a) / np.diagonal(DPSO.in_gauge("lower").K) - 1.0)
+    assert abs(left) < 0.15 * 3.5 * part**2
 
 
 def test_large_residuals_are_told_beyond_the_chance_of_their_estimate():

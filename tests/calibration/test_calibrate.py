@@ -279,15 +279,19 @@ def test_weak_poses_warn_and_still_give_numbers():
 
 
 def test_many_noisy_hand_held_samples_find_the_physical_minimum():
-    """16 000 samples with 0.5 m/s^2 of noise: the minimum at K_A = 0 is deeper and is not taken."""
+    """16 000 samples with 0.5 m/s^2 of noise: the minimum at K_A = 0 is deeper and is not taken.
+
+    Such noise biases the scale factors by 0.9 %, ten sigma; that is taken off, and may still matter.
+    """
     u = Streams(3, [0]).normal(16_000, 3)[0]
     u /= np.linalg.norm(u, axis=1)[:, None]
     for optimizer in ("levenberg-marquardt", "de-pso"):
         parameters = {"iterations": 60} if optimizer == "de-pso" else {}
         settings = Settings(optimizer=optimizer, g=G, parameters=parameters)
         result = calibrate(readings(u, sigma=0.5), settings)
-        _close(result, DPSO, 0.03)
-        assert result.verdict == "good"
+        _close(result, DPSO, 0.003)
+        assert result.verdict == "suspect"
+        assert "noise-bias" in {notice.key for notice in result.warnings}
         assert np.linalg.norm(result.K_A) > 0.9 * np.linalg.norm(DPSO.K_A)
         assert np.linalg.norm(result.f_0) < 0.1 * G
         assert result.s == pytest.approx(0.5, rel=0.1)
@@ -340,9 +344,10 @@ def test_a_robust_loss_minimises_its_loss(robust):
     """The weighted cost at its own weights is stationary: the sum psi(e) times its gradient vanishes."""
     data = _with_outlier(0.02)
     result = calibrate(data, _fast(robust=robust))
-    e = np.array([np.linalg.norm(result.model.specific_force(n)) for n in data.output()])
+    agreeing = np.delete(data.output(), result.outliers, axis=0)
+    e = np.array([np.linalg.norm(result.model.specific_force(n)) for n in agreeing])
     e = (G**2 - e**2) / (2 * G)
-    s = 1.4826 * np.median(np.abs(e)) / np.sqrt(15 / 24)
+    s = 1.4826 * np.median(np.abs(e)) / np.sqrt(1 - 9 / len(agreeing))
     z = e / s
     psi = np.clip(z, -1.345, 1.345) if robust == "huber" else z / np.sqrt(1 + z * z)
     rows = []
@@ -354,7 +359,7 @@ def test_a_robust_loss_minimises_its_loss(robust):
                 K[[0, 1, 2, 1, 2, 2][p], [0, 1, 2, 0, 0, 1][p]] += side * 0.1
             else:
                 D[p - 6] += side
-            f = np.linalg.solve(K, (data.output() - D).T)
+            f = np.linalg.solve(K, (agreeing - D).T)
             ends.append((G**2 - (f**2).sum(axis=0)) / (2 * G))
         rows.append(ends[0] - ends[1])
     rows = np.array(rows)

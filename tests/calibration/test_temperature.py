@@ -98,7 +98,6 @@ def _gap():
         (lambda: warm(degrees=DEGREES[12:36:2], u=U[12:36:2]), {}, "12 poses are too few"),
         # every attitude at one temperature of its own: cold faces, warm corners
         (lambda: warm(degrees=np.r_[[10.0], np.full(47, 40.0)]), {}, "do not determine slopes"),
-        (lambda: warm(), {"robust": "huber"}, "least squares only"),
     ],
 )
 def test_where_the_data_do_not_determine_slopes_the_model_is_plain(data, settings, words):

@@ -65,6 +65,17 @@ def test_raw_is_detect_and_calibrate_in_one(run, log):
     assert np.abs(away[lower] / np.array(one["sigma"]["K_a"])[lower]).max() < 4
 
 
+def test_a_log_is_verified_as_it_is_calibrated(run, log):
+    assert run("calibrate", log, "--raw", "-o", "result.yaml").code == 0
+    assert run("detect", log, "-q", "-o", "poses.csv").code == 0
+    one = json.loads(run("verify", "result.yaml", log, "--raw", "--format", "json").out)
+    two = json.loads(run("verify", "result.yaml", "poses.csv", "--format", "json").out)
+    assert one["verdict"] == two["verdict"] == "unchanged"
+    assert one["chance"] == pytest.approx(two["chance"], rel=1e-6)
+    assert one["data"]["sha256"] == hashlib.sha256(Path(log).read_bytes()).hexdigest()
+    assert "--min-poses needs --raw" in run("verify", "result.yaml", "poses.csv", "--min-poses", "3").err
+
+
 def test_a_raw_log_that_is_taken_for_poses_is_told(run, log):
     said = "Each row is taken for a pose at rest. If these"
     plain = run("calibrate", log, "--optimizer", "ellipsoid", "-o", "wrong.yaml")

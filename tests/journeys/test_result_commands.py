@@ -102,7 +102,7 @@ def test_readings_that_cannot_tell_fail(run, result, other):
     record = json.loads(plain.out)
     assert (plain.code, record["verdict"]) == (1, "inconclusive")
     assert plain.err == "".join(
-        f"accelcal: wrong.csv: warning: {notice['text']} {notice['remedy']}\n"
+        f"accelcal: wrong.csv: {notice['severity']}: {notice['text']} {notice['remedy']}".rstrip() + "\n"
         for notice in record["warnings"]
     )
     assert run("calibrate", "wrong.csv", "--g", G, "-o", "wrong.yaml", "-q").code == 1

@@ -16,7 +16,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
-from accelcal_cli.verification import verify
+from accelcal_cli.verification.verify import verify
 from accelcal_cli.views.verification import differences, evidence
 
 G, SIGMA = 9.8, 2e-3
@@ -158,7 +158,7 @@ def test_rows_of_a_log_are_no_poses():
     u = np.stack([np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)], axis=1)
     waves = np.stack([np.sin(7 * t), np.cos(5 * t), np.sin(3 * t)], axis=1)
     found = verify(result(), Readings.from_array(MEMS.output(G * u + waves)))
-    assert found.chance < 1e-9
+    assert found.freedom < 100
     assert found.verdict == "inconclusive"
     assert any("themselves are doubtful" in line for line in found.reasons)
     assert "6,000 rows are a log" in found.warnings[0].text
@@ -303,8 +303,8 @@ def test_an_axis_that_died_is_a_matter_of_the_sensor():
 
 
 def test_readings_that_determine_nothing_are_never_unchanged(monkeypatch):
-    monkeypatch.setattr("accelcal_cli.verification.check_unit", lambda *_: None)
-    monkeypatch.setattr("accelcal_cli.verification.limitations_of", lambda *_: ())
+    monkeypatch.setattr("accelcal_cli.verification.verify.check_unit", lambda *_: None)
+    monkeypatch.setattr("accelcal_cli.verification.verify.limitations_of", lambda *_: ())
     plain = ErrorModel(1670.0 * np.eye(3), np.zeros(3))
     old = calibrate(readings(TURNS, model=plain, sigma=SIGMA, seed=1), FAST)
     found = verify(old, Readings.from_array(new(poses.faces()[:2], model=plain).output() / 1e4))
@@ -320,3 +320,29 @@ def test_copies_are_no_new_readings_and_are_not_called_a_log():
     assert found.verdict == "inconclusive"
     assert any("themselves are doubtful, as the warnings say" in reason for reason in found.reasons)
     assert any("repeat another to the last digit" in notice.text for notice in found.warnings)
+    output = np.repeat(new(poses.edges()[:6], moved(bias=(0.5, 0.5, 0))).output(), 4, axis=0)
+    changed = verify(result(), Readings.from_array(output))
+    assert changed.chance < 1e-9
+    assert changed.verdict == "inconclusive"
+
+
+def test_a_suspect_result_is_said_and_is_no_reason_against_the_readings():
+    """One pose of the result is wrong by two thousandths: what the others say still holds to their noise."""
+    output = readings(TURNS, model=MEMS, sigma=SIGMA, seed=1).output().copy()
+    output[3] *= 1.002
+    old = calibrate(Readings.from_array(output), FAST)
+    assert old.verdict == "suspect"
+    found = verify(old, new())
+    assert found.verdict == "unchanged"
+    assert [(n.key, n.severity) for n in found.warnings] == [("suspect-result", "note")]
+    assert found.warnings[0].text.startswith("The result is suspect itself (outliers)")
+
+
+def test_the_freedom_of_sigma_counts_not_the_rows():
+    """Rows of 24 attitudes that follow each other: sigma has few degrees of freedom, however many rows there are."""
+    shared = np.repeat(noise(24, SIGMA, 5), 20, axis=0)
+    rows = np.repeat(TURNS, 20, axis=0)
+    output = MEMS.output(G * rows + shared + noise(480, 0.1 * SIGMA, 6))
+    found = verify(result(), Readings.from_array(output))
+    assert found.freedom < 24
+    assert any(notice.key == "correlated" for notice in found.warnings)

@@ -1,0 +1,1 @@
+"""Verification: an old result against new readings of the sensor."""
