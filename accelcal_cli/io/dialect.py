@@ -1,4 +1,4 @@
-"""How a text table is written: separator, decimal mark, header; `sniff` finds it from the first lines.
+"""How a text is written: separator, decimal mark, header, words between numbers; `understand` finds it from the head.
 
 The parsers of reader.py and the writer of rewrite.py share the reading of one line that is defined here; what stands
 above a table is told apart in preamble.py.
@@ -12,6 +12,7 @@ import re
 from dataclasses import dataclass, field, replace
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.lines import LineFilter, find_filter
 from accelcal_cli.io.preamble import AHEAD, LAYOUTS, Facts, find_layout, is_known, read_facts
 from accelcal_cli.io.stream import LONGEST_LINE
 from accelcal_cli.io.vocabulary import is_unit_row
@@ -33,6 +34,10 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 
 FEWEST_THOUSANDS = 6
 """Cells such as 33,368 from which on they are thousands, where none says that the comma is a decimal mark."""
+
+
+_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->")
+"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``."""
 
 
 class ThousandsError(DataError):
@@ -92,6 +97,50 @@ def looks_numeric(cell: str, decimal_comma: bool = True) -> bool:
     except ValueError:
         return False
     return True
+
+
+def understand(
+    head: bytes, source: str, skip: int = 0, prefix: str | None = None
+) -> tuple[LineFilter | None, Dialect]:
+    """Return the dialect of a text, and the filter of its lines where its numbers stand among words.
+
+    Args:
+        head: its first bytes; source: named in messages; skip: lines at its beginning that are not looked at.
+        prefix: what the lines of readings begin with, None to find them.
+
+    Raises:
+        DataError: neither a table nor lines of readings.
+    """
+    dialect: Dialect | None = None
+    fault: DataError | None = None
+    if prefix is None:
+        try:
+            dialect = sniff(head, source, skip)
+        except ThousandsError:
+            raise
+        except DataError as problem:
+            fault = problem
+        if dialect is not None and not _is_worded(dialect):
+            return None, dialect
+    lines = head[: 1 << 18].decode(errors="replace").splitlines()[skip:]
+    found = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
+    if found is None:
+        if dialect is None:
+            raise fault or DataError(f"{source}: no line has three numbers; readings were expected")
+        return None, dialect
+    dialect = sniff(found.translate(head), source, skip)
+    units = found.kind.units if any(found.kind.units) else None
+    if found.kind.names is not None:
+        dialect = replace(dialect, names=found.kind.names, header_line=0)
+    return found, replace(dialect, units=units, above=0)
+
+
+def _is_worded(dialect: Dialect) -> bool:
+    """Return whether words stand between the numbers of a line rather than above them."""
+    numbers = sum(looks_numeric(cell) for cell in dialect.first)
+    cells = dialect.first if dialect.header_line == 0 else dialect.names or ()
+    marked = any(_MARKED.fullmatch(cell) for cell in cells)
+    return marked or (dialect.header_line == 0 and numbers < 3)
 
 
 def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:

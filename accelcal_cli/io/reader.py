@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import io
 import math
-import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
 
@@ -25,15 +24,13 @@ from accelcal_cli.io.dialect import (
     MARKS,
     SAMPLE,
     Dialect,
-    ThousandsError,
     decode_line,
     is_blank,
     is_comment,
     looks_numeric,
-    sniff,
     split_cells,
+    understand,
 )
-from accelcal_cli.io.lines import LineFilter, find_filter
 from accelcal_cli.io.preamble import Facts
 from accelcal_cli.io.skipped import LineMap, PassedLines
 from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
@@ -53,9 +50,6 @@ NO_LABEL = "is empty; every row needs its label"
 
 MOST_BAD = 0.05
 """Part of the rows that --skip-bad leaves out at most."""
-
-_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->")
-"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``."""
 
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
 
@@ -195,7 +189,7 @@ class TextTable:
         """Find the dialect of `source` from its head."""
         self.name = source.name
         self._source, self._options = source, options
-        self._words, self.dialect = _understand(source, options)
+        self._words, self.dialect = understand(source.head, source.name, options.skip_rows, options.line)
         self.names, self.units, self.facts = self.dialect.names, self.dialect.units, self.dialect.facts
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
@@ -298,40 +292,6 @@ class TextTable:
     def close(self) -> None:
         """Release the file."""
         self._source.close()
-
-
-def _understand(source: ByteSource, options: ReadOptions) -> tuple[LineFilter | None, Dialect]:
-    """Return the dialect of a text, and the filter of its lines where its numbers stand among words."""
-    dialect: Dialect | None = None
-    fault: DataError | None = None
-    if options.line is None:
-        try:
-            dialect = sniff(source.head, source.name, options.skip_rows)
-        except ThousandsError:
-            raise
-        except DataError as problem:
-            fault = problem
-        if dialect is not None and not _is_worded(dialect):
-            return None, dialect
-    lines = source.head[: 1 << 18].decode(errors="replace").splitlines()[options.skip_rows :]
-    found = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source.name, options.line)
-    if found is None:
-        if dialect is None:
-            raise fault or DataError(f"{source.name}: no line has three numbers; readings were expected")
-        return None, dialect
-    dialect = sniff(found.translate(source.head), source.name, options.skip_rows)
-    units = found.kind.units if any(found.kind.units) else None
-    if found.kind.names is not None:
-        dialect = replace(dialect, names=found.kind.names, header_line=0)
-    return found, replace(dialect, units=units, above=0)
-
-
-def _is_worded(dialect: Dialect) -> bool:
-    """Return whether words stand between the numbers of a line rather than above them."""
-    numbers = sum(looks_numeric(cell) for cell in dialect.first)
-    cells = dialect.first if dialect.header_line == 0 else dialect.names or ()
-    marked = any(_MARKED.fullmatch(cell) for cell in cells)
-    return marked or (dialect.header_line == 0 and numbers < 3)
 
 
 @dataclass(eq=False)
