@@ -12,12 +12,18 @@ import json
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from accelcal_cli.errors import ConfigError
 
+if TYPE_CHECKING:
+    import yaml
+
 CONFIGS = Path(__file__).parent / "configs"
 """The shipped configurations, inside the installed package."""
+
+DEEPEST, MOST_VALUES = 50, 1_000_000
+"""Levels, and values with all aliases written out, of a YAML file at most: a result of 1000 poses has some 20,000."""
 
 if not CONFIGS.is_dir():  # a checkout keeps them beside the package
     CONFIGS = Path(__file__).parent.parent / "configs"
@@ -25,10 +31,20 @@ if not CONFIGS.is_dir():  # a checkout keeps them beside the package
 
 @cache
 def _loader() -> Any:
-    """Return a safe loader that refuses a key given twice: YAML itself would silently keep the last."""
+    """Return a safe loader that refuses a key given twice, which YAML would silently keep the last of, and bombs.
+
+    An alias stands for what it names, which may be an alias again: a page of them becomes gigabytes when it is written
+    or compared. Aliases and depth are bounded before anything is built.
+    """
     import yaml
 
-    class UniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    class BoundedUniqueKeys(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+        def get_single_node(self) -> yaml.Node | None:
+            node: yaml.Node | None = super().get_single_node()
+            if node is not None:
+                _weigh(node, {}, 0)
+            return node
+
         def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
             seen = set()
             for key_node, _ in node.value:
@@ -41,7 +57,29 @@ def _loader() -> Any:
             mapping: dict[Any, Any] = super().construct_mapping(node, deep)
             return mapping
 
-    return UniqueKeys
+    return BoundedUniqueKeys
+
+
+def _weigh(node: yaml.Node, known: dict[int, int], depth: int) -> int:
+    """Return how many values a node stands for with its aliases written out; too many, or too deep, is an error."""
+    if id(node) in known:
+        return known[id(node)]
+    if depth > DEEPEST:
+        raise _too_much(f"nested more than {DEEPEST} deep", node)
+    known[id(node)] = MOST_VALUES  # an alias of itself
+    entries = node.value if isinstance(node.value, list) else []  # of a mapping these are pairs
+    children = [part for entry in entries for part in (entry if isinstance(entry, tuple) else (entry,))]
+    weight = 1 + sum(_weigh(child, known, depth + 1) for child in children)
+    if weight > MOST_VALUES:
+        raise _too_much(f"its aliases stand for more than {MOST_VALUES:,} values", node)
+    known[id(node)] = weight
+    return weight
+
+
+def _too_much(fault: str, node: yaml.Node) -> Exception:
+    from yaml.constructor import ConstructorError
+
+    return ConstructorError(None, None, fault, node.start_mark)
 
 
 def load_mapping(path: Path) -> dict[str, Any]:

@@ -7,7 +7,16 @@ The command line prints it and exits with 2; the library raises it.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+"""Characters by which a text could steer a terminal, or turn the order of what is read, but tabs and line ends."""
+
+
+def visible(text: str) -> str:
+    """Return a text with control characters written out: what a file holds must not steer the terminal."""
+    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
 
 
 class AccelcalError(Exception):

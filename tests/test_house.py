@@ -14,12 +14,12 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import flow  # noqa: E402
 
-FILES, LINES = 138, 600
+FILES, LINES = 143, 600
 
 FLOW = {
-    "calibrate": (42, 76),  # files and pairs of files; 61 and 101 in the first version
-    "detect": (38, 59),  # 58 and 89
-    "fleet": (37, 46),  # 56 and 69
+    "calibrate": (43, 78),  # files and pairs of files; 61 and 101 in the first version
+    "detect": (43, 67),  # 58 and 89
+    "fleet": (42, 68),  # 56 and 69
     "benchmark": (28, 64),  # 59 and 64
 }
 RETURNS = 67

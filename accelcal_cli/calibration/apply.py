@@ -76,7 +76,7 @@ class Correction:
 
     def __init__(self, result: Calibration, options: ColumnOptions) -> None:
         """Take over the model, the temperature slopes and the options."""
-        own = "g" if result.unit == "g" else "m/s^2"
+        own = result.unit
         self.g, self.factor = result.g, UNITS[options.unit or own] / UNITS[own]
         self.model, self.slopes = result.model, result.temperature
         self.tilt = Tilt.of(result, options.noise) if options.tilt else None

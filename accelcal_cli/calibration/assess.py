@@ -29,6 +29,7 @@ from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.calibration.weights import SURELY_TREMBLES
 from accelcal_cli.notices import Notice, Severity, are_serious
+from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES, axis_up
 
 FEWEST_KNOWN = 6
@@ -539,8 +540,8 @@ def _unfinished(agreeing: int, runs: int, left: float) -> tuple[Notice, ...]:
 
 
 def odd_gravity(g: float) -> tuple[Notice, ...]:
-    """Return a warning of a gravity, m/s^2 or 1 for units of g, that is not found on Earth."""
-    if g == 1.0 or EARTH[0] <= g <= EARTH[1]:
+    """Return a warning of a gravity, in m/s^2, g or mg, that is not found on Earth."""
+    if any(EARTH[0] <= g * STANDARD_GRAVITY / size <= EARTH[1] for size in OUTPUT_OF_1_G.values()):
         return ()
     text = (
         f"g = {g:g} is neither gravity on Earth, {EARTH[0]} to {EARTH[1]} m/s^2, nor 1, for readings in units of g: "

@@ -151,7 +151,8 @@ def _number(value: float) -> float | None:
 
 
 def _origin(readings: Readings) -> dict[str, object]:
-    return {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
+    named = {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
+    return {**named, **asdict(readings.form)}
 
 
 def _nine_of(geometry: Float, view: Float) -> Float:

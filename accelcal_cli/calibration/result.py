@@ -34,7 +34,10 @@ from accelcal_cli.config import parse_mapping, read_text
 from accelcal_cli.errors import ConfigError, DataError, UsageError
 from accelcal_cli.notices import Notice
 from accelcal_cli.schema import Limits, array, from_mapping, to_mapping
-from accelcal_cli.sensor.model import ErrorModel, Gauge
+from accelcal_cli.sensor.model import OUTPUT_OF_1_G, ErrorModel, Gauge
+
+NEAR_G = 0.02
+"""Local gravity is within this part of 9.80665 m/s^2, anywhere."""
 
 SCHEMA = "accelcal/calibration/2"
 """Name and version of the record; a reader refuses what it does not know."""
@@ -269,8 +272,10 @@ class Calibration:
 
     @property
     def unit(self) -> str:
-        """Unit of the specific force: g when the readings were calibrated against g = 1."""
-        return "g" if self.g == 1.0 else "m/s^2"
+        """Unit of the specific force: that of the readings where g was taken in it, as g = 1 is."""
+        own = self.data.get("unit")
+        near = own in ("g", "mg") and abs(self.g / OUTPUT_OF_1_G[own] - 1.0) < NEAR_G
+        return str(own) if near else "g" if self.g == 1.0 else "m/s^2"
 
     @property
     def held(self) -> Bool:

@@ -17,13 +17,14 @@ in_force = options.panel("Specific force")
 
 
 def command(
+    *,
     result: options.ResultFile,
     data: Annotated[
         str,
         typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.", rich_help_panel="Input"),
     ],
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     force: options.Force = False,
     unit: Annotated[
         str | None,
@@ -67,9 +68,10 @@ def command(
     calibration = options.load_result(result, data)
     calibration.check_determined(result, force=force)
     options.warn(result, calibration.warnings, quiet)
-    table = open_table(data, sys.stdin.buffer, hashed=False)
+    read = form.read_options()
+    table = open_table(data, sys.stdin.buffer, hashed=False, options=read)
     try:
-        restrict(table, where or ())
+        restrict(table, read.where)
         log = prepare(calibration, table, options.split_columns(columns), wanted)
         parquet = Path(output).suffix.lower() in PARQUET
         if parquet and not log.parquet:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -103,7 +103,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     gravity: options.GravityOptions,
     config: Annotated[
         Path | None, options.in_input(help="YAML file: optimizer, its parameters, box, gauge, ...")
@@ -145,11 +145,18 @@ def command(
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)
     if raw:
-        readings = log.poses(data, columns, where, settings.g, misalignment=settings.misalignment)
+        readings = log.poses(
+            data,
+            columns,
+            lambda unit: local_g(settings, gravity, config, unit),
+            form,
+            misalignment=settings.misalignment,
+        )
     else:
         readings = read_readings(
-            data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
         )
+    settings = replace(settings, g=local_g(settings, gravity, config, readings.form.unit))
     result = calibrate(readings, settings)
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():
@@ -176,6 +183,17 @@ def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Setting
             aligned = {**keys, **stated}.get("misalignment") is False
             stated.setdefault("weights", "n" if aligned else "auto")
     return load_settings(config, stated)
+
+
+def local_g(
+    settings: Settings, gravity: options.GravityOptions, config: Path | None, unit: str | None
+) -> float:
+    """Return local gravity in the unit of the readings; what the settings file states is taken as it is."""
+    from accelcal_cli.config import load_mapping
+
+    filed = config is not None and "g" in load_mapping(config) and gravity.stated() is None
+    own = None if filed else gravity.in_unit(unit)
+    return settings.g if own is None else own
 
 
 def _units_of_g(result: Calibration) -> str:

@@ -35,6 +35,14 @@ def command(
         str,
         options.in_input(help="Which numbers of a line are x, y and z, counted from 1, separated by commas."),
     ] = "1,2,3",
+    line: Annotated[
+        str | None,
+        options.in_input(
+            help="What the lines of readings begin with, among lines of several kinds.",
+            show_default="found by their words",
+            metavar="PREFIX",
+        ),
+    ] = None,
     rate: Annotated[float, options.in_input(help="Readings per second.")] = 100.0,
     unit: Annotated[
         str | None,
@@ -108,7 +116,13 @@ def command(
         unit if unit in OUTPUT_OF_1_G else None,
     )
     lines = file_lines(sys.stdin.buffer) if port == "-" else port_lines(port, baud, timeout)
-    _run(capture, readings(lines, chosen, "<stdin>" if port == "-" else port), output, quiet)
+    name = "<stdin>" if port == "-" else port
+    _run(
+        capture,
+        readings(lines, chosen, name, line, lambda note: options.tell([note], quiet)),
+        output,
+        quiet,
+    )
 
 
 def _columns(text: str) -> list[int]:

@@ -91,7 +91,7 @@ def command(
         ),
     ] = None,
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     g: Annotated[
         float | None,
         options.in_input(
@@ -166,9 +166,9 @@ def command(
     entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
     source: Simulation | Recording
     if data is not None:
-        source = _recorded(data, columns, where, space.g, simulation)
-    elif columns is not None or where:
-        raise UsageError(f"{'--where' if columns is None else '--columns'} needs a file of readings")
+        source = _recorded(data, columns, form, space.g, simulation)
+    elif needless := options.stated(columns=columns, **vars(form)):
+        raise UsageError(f"--{next(iter(needless)).replace('_', '-')} needs a file of readings")
     else:
         source = simulation.scenario()
     study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
@@ -186,7 +186,7 @@ def command(
 
 
 def _recorded(
-    data: str, columns: str | None, where: list[str] | None, g: float, simulation: SimulationOptions
+    data: str, columns: str | None, form: options.TextOptions, g: float, simulation: SimulationOptions
 ) -> Recording:
     from accelcal_cli.io.readings import read_readings
     from accelcal_cli.studies.scenarios import Recording
@@ -196,5 +196,8 @@ def _recorded(
         raise UsageError(f"{', '.join(stated)}: not with a file of readings, which are not simulated")
     options.check_input(data)
     return Recording.of(
-        read_readings(data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()), g
+        read_readings(
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
+        ),
+        g,
     )

@@ -23,7 +23,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     gravity: options.GravityOptions,
     log: options.DetectionOptions,
     output: Annotated[
@@ -56,9 +56,15 @@ def command(
         raise UsageError(f'--plot "{plot}": expected another file than --output')
     options.check_files([data], {"-o": output, "--plot": plot})
     options.check_plot(plot)
-    local_g = gravity.stated() or STANDARD_GRAVITY
+    gravity.stated()  # refuses what is wrong before the file is read
     try:
-        detection = log.detect(data, columns, where, local_g, picture=plot is not None)
+        detection = log.detect(
+            data,
+            columns,
+            lambda unit: gravity.in_unit(unit) or STANDARD_GRAVITY,
+            form,
+            picture=plot is not None,
+        )
     except TooFewPosesError as failure:
         _draw(failure.detection, plot, quiet)
         raise

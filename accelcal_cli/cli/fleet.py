@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -45,7 +46,7 @@ def command(
         ),
     ] = None,
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     gravity: options.GravityOptions,
     config: Annotated[
         Path | None, options.in_input(help="YAML file: box, nominal, gauge, weights, g.")
@@ -113,8 +114,15 @@ def command(
         )
     check_settings(settings)
     readings = read_fleet(
-        data, options.split_columns(columns), sensor_column, stdin=sys.stdin.buffer, where=where or ()
+        data,
+        options.split_columns(columns),
+        sensor_column,
+        stdin=sys.stdin.buffer,
+        options=form.read_options(),
     )
+    own = gravity.in_unit(readings.unit)
+    if own is not None and (stated_g is not None or "g" not in filed):
+        settings = replace(settings, g=own)
     if folder and output is not None:
         with whole_folder(output) as results:
             fleet = calibrate_fleet(

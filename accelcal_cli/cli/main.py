@@ -20,7 +20,7 @@ import typer.main
 
 from accelcal_cli import __version__
 from accelcal_cli.cli import process
-from accelcal_cli.errors import AccelcalError, Interrupted
+from accelcal_cli.errors import AccelcalError, Interrupted, visible
 
 BAD_INPUT, INTERRUPTED = 2, 130
 CHOICES = "{choices}"
@@ -251,7 +251,7 @@ def _open_streams() -> None:
 
 def _fail(message: str, code: int) -> NoReturn:
     try:
-        typer.echo(f"accelcal: {message}", err=True)
+        typer.echo(visible(f"accelcal: {message}"[:4000]), err=True)
     except OSError:  # a terminal that is gone
         process.drop(sys.stderr)
     sys.exit(code)

@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.errors import UsageError, did_you_mean
+from accelcal_cli.errors import UsageError, did_you_mean, visible
 from accelcal_cli.registry import is_mentioned
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.detection.detect import Detection, DetectSettings
+    from accelcal_cli.io.reader import ReadOptions
     from accelcal_cli.io.readings import Readings
     from accelcal_cli.notices import Notice
     from accelcal_cli.views.blocks import Block, Table
@@ -163,12 +164,6 @@ Columns = Annotated[
     str | None,
     in_input("--columns", help="The three output columns: names, or numbers from 1, separated by commas."),
 ]
-Where = Annotated[
-    list[str] | None,
-    in_input(
-        "--where", help="Read only rows with this value, as device=0; repeatable.", metavar="COLUMN=VALUE"
-    ),
-]
 Force = Annotated[bool, in_input("--force", help="Use a result although its verdict is undetermined.")]
 Format = Annotated[
     str,
@@ -196,6 +191,23 @@ class GravityOptions:
     latitude: Annotated[float | None, in_input(help="Degrees; gravity from WGS84 instead of --g.")] = None
     height: Annotated[float | None, in_input(help="Metres above the ellipsoid, with --latitude.")] = None
 
+    def in_unit(self, unit: str | None) -> float | None:
+        """Return the stated local gravity in the unit of the readings, g or mg; without one as `stated` does.
+
+        Where nothing was stated it is 1 g in units of g, which is as good as the 9.80665 of other readings. What --g
+        states is taken as it is: the user knows the unit.
+
+        Args:
+            unit: as the file states it, None where it does not.
+        """
+        from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
+
+        stated = self.stated()
+        if unit not in ("g", "mg") or self.g is not None:
+            return stated
+        size = OUTPUT_OF_1_G[unit]
+        return size if stated is None else stated * size / STANDARD_GRAVITY
+
     def stated(self) -> float | None:
         """Return the stated local gravity in m/s^2, or None when nothing was stated.
 
@@ -211,6 +223,47 @@ class GravityOptions:
         if self.g is not None:
             return check_gravity(self.g)
         return None if self.latitude is None else normal_gravity(self.latitude, self.height or 0.0)
+
+
+@dataclass(frozen=True)
+class TextOptions:
+    """Which rows of a table to read, and what a user knows of its form."""
+
+    where: Annotated[
+        list[str] | None,
+        in_input(help="Read only rows with this value, as device=0; repeatable.", metavar="COLUMN=VALUE"),
+    ] = None
+    skip_rows: Annotated[
+        int | None, in_input(help="Lines at the beginning that are not looked at.", min=0, metavar="N")
+    ] = None
+    skip_bad: Annotated[
+        bool | None,
+        in_input("--skip-bad", help="Leave out rows that cannot be read, up to 5 % of them."),
+    ] = None
+    line: Annotated[
+        str | None,
+        in_input(
+            help="What the lines of readings begin with, among lines of several kinds.",
+            show_default="found by their words",
+            metavar="PREFIX",
+        ),
+    ] = None
+    count: Annotated[
+        str | None,
+        in_input(
+            help="The column of counts of raw readings, or none.",
+            show_default="found by name",
+            metavar="COLUMN",
+        ),
+    ] = None
+
+    def read_options(self) -> ReadOptions:
+        """Return the options as the library takes them."""
+        from accelcal_cli.io.reader import ReadOptions
+
+        return ReadOptions(
+            self.skip_rows or 0, bool(self.skip_bad), self.line, self.count, tuple(self.where or ())
+        )
 
 
 LARGEST_MULTIPLIER = 1e6
@@ -297,43 +350,56 @@ class DetectionOptions:
             raise UsageError(f"--{next(iter(detection)).replace('_', '-')} needs --raw")
 
     def poses(
-        self, data: str, columns: str | None, where: list[str] | None, g: float, *, misalignment: bool
+        self,
+        data: str,
+        columns: str | None,
+        gravity: Callable[[str | None], float],
+        form: TextOptions,
+        *,
+        misalignment: bool,
     ) -> Readings:
         """Return the static poses of a raw log; faces are enough of them where no misalignment is asked for.
 
         Args:
-            data, columns, where, g: see `detect`.
+            data, columns, gravity, form: see `detect`.
             misalignment: whether misalignments are to be estimated.
         """
         few = self.min_poses is None and not misalignment
-        return (replace(self, min_poses=FACES) if few else self).detect(data, columns, where, g).readings()
+        own = replace(self, min_poses=FACES) if few else self
+        return own.detect(data, columns, gravity, form).readings()
 
     def detect(
-        self, data: str, columns: str | None, where: list[str] | None, g: float, picture: bool = False
+        self,
+        data: str,
+        columns: str | None,
+        gravity: Callable[[str | None], float],
+        form: TextOptions,
+        picture: bool = False,
     ) -> Detection:
         """Find the static poses of a raw log.
 
         Args:
             data: file, or - for standard input.
-            columns: option --columns; where: options --where.
-            g: local gravity, m/s^2.
+            columns: option --columns.
+            gravity: returns local gravity in the unit that the file states.
+            form: which rows to read, and what is known of their form.
             picture: keep what a picture of the log needs.
         """
         from accelcal_cli.detection.detect import detect
         from accelcal_cli.detection.rawlog import open_raw_log
 
         check_input(data)
-        settings = self._settings(g)
+        self._settings(1.0)  # refuses what is wrong before the file is read
         log = open_raw_log(
             data,
             split_columns(columns),
             split_columns(self.gyro),
             self.time,
             stdin=sys.stdin.buffer,
-            where=where or (),
+            options=form.read_options(),
         )
         try:
-            return detect(log, settings, picture)
+            return detect(log, self._settings(gravity(log.columns.unit)), picture)
         finally:
             log.close()
 
@@ -502,7 +568,7 @@ def print_result(
 def tell(notes: Iterable[str], quiet: bool = False) -> None:
     """Say something on standard error, a line each, unless quiet."""
     for note in () if quiet else notes:
-        typer.echo(f"accelcal: {note}", err=True)
+        typer.echo(visible(f"accelcal: {note}"), err=True)
 
 
 def tell_written(paths: Iterable[str | None], quiet: bool) -> None:

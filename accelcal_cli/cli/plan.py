@@ -35,7 +35,7 @@ def command(
         ),
     ] = None,
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     gravity: options.GravityOptions,
     poses: Annotated[
         int | None,
@@ -78,7 +78,7 @@ def command(
     if poses is not None and add is not None:
         raise UsageError("--poses and --add: expected one of them, not both")
     stated_g = gravity.stated()
-    so_far = _so_far(data, columns, where, stated_g) if data is not None else None
+    so_far = _so_far(data, columns, form, gravity) if data is not None else None
     proposal = _plan(so_far, poses, add, fixture, noise, stated_g)
     with process.even_if_unread():
         options.print_result(
@@ -94,7 +94,9 @@ def command(
         raise typer.Exit(options.BAD_VERDICT)
 
 
-def _so_far(data: str, columns: str | None, where: list[str] | None, g: float | None) -> Calibration:
+def _so_far(
+    data: str, columns: str | None, form: options.TextOptions, gravity: options.GravityOptions
+) -> Calibration:
     """Return the calibration of the poses so far."""
     from accelcal_cli.calibration.calibrate import calibrate
     from accelcal_cli.calibration.result import is_result, load_result
@@ -104,13 +106,14 @@ def _so_far(data: str, columns: str | None, where: list[str] | None, g: float | 
     options.check_input(data)
     stdin = io.BufferedReader(cast("Any", sys.stdin.buffer)) if data == "-" else None
     if Path(data).suffix in RESULTS or (stdin is not None and is_result(_head(stdin))):
-        if columns is not None or where or g is not None:
+        if columns is not None or form.where or gravity.stated() is not None:
             raise UsageError(
                 f"{data}: a result file has its own columns and g; leave out --columns, --where, --g and --latitude"
             )
         return load_result(data if stdin is None else "<stdin>", stdin)
+    readings = read_readings(data, options.split_columns(columns), stdin=stdin, options=form.read_options())
+    g = gravity.in_unit(readings.form.unit)
     settings = load_settings(None, {"optimizer": "levenberg-marquardt", **({} if g is None else {"g": g})})
-    readings = read_readings(data, options.split_columns(columns), stdin=stdin, where=where or ())
     return calibrate(readings, settings)
 
 

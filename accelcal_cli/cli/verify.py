@@ -24,7 +24,7 @@ def command(
         ),
     ],
     columns: options.Columns = None,
-    where: options.Where = None,
+    form: options.TextOptions,
     raw: Annotated[
         bool,
         options.in_log("--raw", help="The file is a raw log: find its static poses first, as detect does."),
@@ -65,10 +65,10 @@ def command(
             f"--g {g:g}: {result} was calibrated with g = {old.g:.9g}; leave out --g, or calibrate anew"
         )
     if raw:
-        readings = log.poses(data, columns, where, old.g, misalignment=not old.held.any())
+        readings = log.poses(data, columns, lambda _: old.g, form, misalignment=not old.held.any())
     else:
         readings = read_readings(
-            data, options.split_columns(columns), stdin=sys.stdin.buffer, where=where or ()
+            data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
         )
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():

@@ -31,7 +31,7 @@ from accelcal_cli.detection.log_screening import Liveliness, alternating, check_
 from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, read_tiles
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.readings import InputForm, Readings
 from accelcal_cli.io.screening import LOOKED_AT, Screened
 from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
@@ -102,6 +102,7 @@ class Detection:
         rate: rows per second, Hz, or None; rows: the lengths used.
         level: what the multipliers apply to; multiplier: the one kept; candidates: all of them.
         intervals: the poses.
+        form: of the file.
         envelope: of the log, for a picture; None unless asked for.
         warnings: what the rows show that is no rest.
     """
@@ -118,6 +119,7 @@ class Detection:
     intervals: Intervals
     settings: DetectSettings
     notes: tuple[str, ...]
+    form: InputForm
     envelope: Envelope | None = None
     warnings: tuple[Notice, ...] = ()
 
@@ -134,11 +136,14 @@ class Detection:
             intervals.where,
             self.source,
             single=False,
+            warm=readings.temperature is not None,
             count=intervals.n[first].astype(float),
             scatter=intervals.scatter[first],
         )
         more = [notice for notice in screened.notices() if notice.key not in said]
-        return readings.known_as(self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more))
+        return readings.known_as(
+            self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more), self.form
+        )
 
     def summary(self) -> str:
         """Return what was found, and with which settings, in one sentence."""
@@ -204,6 +209,7 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         intervals=shown,
         settings=settings,
         notes=(*log.notes, *gaps),
+        form=replace(log.form, rows=tiles.rows, rate_hz=rate),
         warnings=warnings,
         envelope=envelope,
     )
@@ -278,9 +284,15 @@ def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
 
 
 def readings_of(intervals: Intervals, source: str) -> Readings:
-    """Return the intervals as readings, not screened: mean, count and scatter of each."""
+    """Return the intervals as readings, not screened: mean, count, scatter and temperature of each."""
+    degrees = intervals.temperature
     return Readings.from_array(
-        intervals.mean, source=source, count=intervals.n, scatter=intervals.scatter, warnings=()
+        intervals.mean,
+        source=source,
+        count=intervals.n,
+        scatter=intervals.scatter,
+        temperature=None if degrees is None or np.isnan(degrees).all() else degrees,
+        warnings=(),
     )
 
 

@@ -59,6 +59,7 @@ class Intervals:
         n: rows averaged, shape (I,).
         mean: shape (I, 3), sensor units; scatter: standard deviation of one row, shape (I, 3), sensor units.
         time: of first and last row, shape (I, 2), as in the log; None without.
+        temperature: mean of each, shape (I,), NaN where no row has one; None without.
     """
 
     start: Int
@@ -67,6 +68,7 @@ class Intervals:
     mean: Float
     scatter: Float
     time: Float | None = None
+    temperature: Float | None = None
 
     def __len__(self) -> int:
         """I."""
@@ -81,6 +83,7 @@ class Intervals:
             self.mean[index],
             self.scatter[index],
             None if self.time is None else self.time[index],
+            None if self.temperature is None else self.temperature[index],
         )
 
     def where(self, i: int) -> str:
@@ -253,7 +256,14 @@ def merge(intervals: Intervals, groups: Sequence[Int]) -> Intervals:
         mean=mean,
         scatter=scatter,
         time=None if time is None else np.stack([time[first, 0], time[last, 1]], axis=1),
+        temperature=None if intervals.temperature is None else _merged(intervals, groups, n),
     )
+
+
+def _merged(intervals: Intervals, groups: Sequence[Int], n: Int) -> Float:
+    """Return the mean temperature of each group of intervals, by their rows, shape (I,)."""
+    degrees = np.zeros(0) if intervals.temperature is None else intervals.temperature
+    return np.array([intervals.n[g] @ degrees[g] for g in groups]) / n
 
 
 def _trim(first: Int, last: Int, lengths: RowLengths) -> tuple[Int, Int]:
@@ -278,19 +288,21 @@ class Pieces:
         tile: rows of a tile; edge: first tile of each piece, and the end of the last, shape (A + 1,).
         moments: rows, mean and squares about it of each piece, shapes (A,), (A, 3), (A, 3).
         time: of the first and last row of each piece, shape (A, 2), or None.
+        warmth: sum of the temperatures of each piece, and how many tiles have one, shape (A, 2), or None.
     """
 
     tile: int
     edge: Int
     moments: Moments
     time: Float | None
+    warmth: Float | None = None
 
     @classmethod
     def of(cls, tiles: Tiles, edge: Int) -> Self:
         """Read the tiles between the edges, in one pass."""
         a, b = edge[:-1], edge[1:]
         count, mean, square = np.zeros(len(a)), np.zeros((len(a), 3)), np.zeros((len(a), 3))
-        time = np.full((len(a), 2), np.nan)
+        time, warmth = np.full((len(a), 2), np.nan), np.zeros((len(a), 2))
         for first, block in tiles.blocks():
             low, high = np.clip(a - first, 0, len(block)), np.clip(b - first, 0, len(block))
             here = np.flatnonzero(high > low)
@@ -299,11 +311,18 @@ class Pieces:
             rows = np.full(len(block), float(tiles.size))
             part = _pool((rows, block[:, :3], block[:, 3:6]), low[here], high[here])
             count[here], mean[here], square[here] = _pool_two((count[here], mean[here], square[here]), part)
+            if tiles.warm:
+                degrees = block[:, tiles.warm_at]
+                known = np.isfinite(degrees)
+                sums = np.cumsum(np.stack([np.where(known, degrees, 0.0), known], axis=1), axis=0)
+                sums = np.concatenate([np.zeros((1, 2)), sums])
+                warmth[here] += sums[high[here]] - sums[low[here]]
             if tiles.timed:
                 begins = here[a[here] >= first]
                 time[begins, 0] = block[low[begins], -2]
                 time[here, 1] = block[high[here] - 1, -1]
-        return cls(tiles.size, edge, (count, mean, square), time if tiles.timed else None)
+        moments = count, mean, square
+        return cls(tiles.size, edge, moments, time if tiles.timed else None, warmth if tiles.warm else None)
 
     def intervals(self, a: Int, b: Int) -> Intervals:
         """Return the intervals of tiles a to b - 1, each shape (I,); a and b are edges."""
@@ -311,7 +330,9 @@ class Pieces:
         count, mean, square = _pool(self.moments, low, high)
         scatter = np.sqrt(square / np.maximum(count - 1, 1)[:, None])
         time = None if self.time is None else np.stack([self.time[low, 0], self.time[high - 1, 1]], axis=1)
-        return Intervals(a * self.tile + 1, b * self.tile, count.astype(np.intp), mean, scatter, time)
+        temperature = None if self.warmth is None else _mean_warmth(self.warmth, low, high)
+        first, last = a * self.tile + 1, b * self.tile
+        return Intervals(first, last, count.astype(np.intp), mean, scatter, time, temperature)
 
     def turning(self, a: Int, b: Int, extent: float) -> Bool:
         """Return which of the intervals of tiles a to b - 1, each shape (I,), turn while they last.
@@ -327,6 +348,13 @@ class Pieces:
         noise = (one.scatter**2).sum(axis=1) / one.n + (other.scatter**2).sum(axis=1) / other.n
         turning[two] = (apart > STEADY * extent) & (apart > BEYOND_NOISE * np.sqrt(noise))
         return turning
+
+
+def _mean_warmth(warmth: Float, low: Int, high: Int) -> Float:
+    """Return the mean temperature of the pieces low to high - 1, shape (I,), NaN where none has one."""
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(warmth, axis=0)])
+    total, tiles = (sums[high] - sums[low]).T
+    return np.asarray(np.divide(total, tiles, out=np.full(len(total), np.nan), where=tiles > 0))
 
 
 def _pool(items: Moments, low: Int, high: Int) -> Moments:

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.detection.rawlog import UNITS, Clock, RawLog
+from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.errors import UsageError
+from accelcal_cli.io.clock import UNITS, Clock
 from accelcal_cli.io.stream import RowStore
 
 IN_MEMORY = 1_000_000
@@ -145,8 +146,11 @@ class Spans:
 
 
 def longest_step(clock: Clock, lengths: RowLengths) -> float:
-    """Return the longest step of the time column that is no gap, in its unit: a window, and LATE periods at least."""
-    return math.inf if clock.period is None else max(lengths.window, LATE) * clock.period
+    """Return the longest step of the time column that is no gap, in its unit: a window, and LATE periods at least.
+
+    Where rows come in bursts, or times are rounded, a pause of the usual length comes on top.
+    """
+    return math.inf if clock.period is None else max(lengths.window, LATE) * clock.period + clock.pause
 
 
 class Gaps:
@@ -214,21 +218,24 @@ class Tiles:
 
     Attributes:
         size: rows of a tile.
-        gyro, timed: whether the log has a gyroscope and time.
+        gyro, timed, warm: whether the log has a gyroscope, time and temperature.
         rows: rows of the log, those left out included.
         low, high: least and greatest reading of each axis, shape (3,), sensor units.
         unusable: which tiles of a block are no readings, shape (B,); None for those of zeros alone.
         gaps: those of the time column.
     """
 
-    def __init__(self, size: int, gyro: bool, timed: bool, longest: float = math.inf) -> None:
+    def __init__(
+        self, size: int, gyro: bool, timed: bool, longest: float = math.inf, *, warm: bool = False
+    ) -> None:
         """Start without tiles; a step of the time column that is longer than `longest` is a gap."""
-        self.size, self.gyro, self.timed = size, gyro, timed
+        self.size, self.gyro, self.timed, self.warm = size, gyro, timed, warm
         self.gaps = Gaps(longest)
         self.rows = 0
+        self.warm_at = 6 + 6 * gyro
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self.unusable: Callable[[Float], Bool] = _are_zero
-        self._store = RowStore(6 + 6 * gyro + 2 * timed, IN_MEMORY)
+        self._store = RowStore(6 + 6 * gyro + warm + 2 * timed, IN_MEMORY)
         self._rest: Float | None = None
 
     @property
@@ -267,6 +274,8 @@ class Tiles:
             off = part - mean[:, None]
             out[:, at] = mean
             out[:, at + 3] = np.einsum("ij,ij->i", off, off)
+        if self.warm:
+            out[:, self.warm_at] = _known_mean(block[6 if self.gyro else 3].reshape(tiles, self.size))
         if self.timed:
             time = block[-1].reshape(tiles, self.size)
             out[:, -2], out[:, -1] = time[:, 0], time[:, -1]
@@ -287,10 +296,18 @@ class Tiles:
 def read_tiles(log: RawLog, lengths: RowLengths, envelope: Envelope | None = None) -> Tiles:
     """Read a log to its end and return its tiles."""
     gyro, timed = log.columns.gyro is not None, log.columns.time is not None
-    tiles = Tiles(lengths.tile, gyro, timed, longest_step(log.clock, lengths))
+    warm = log.columns.temperature is not None
+    tiles = Tiles(lengths.tile, gyro, timed, longest_step(log.clock, lengths), warm=warm)
     for rows in log.blocks():
         tiles.add(rows, envelope)
     return tiles
+
+
+def _known_mean(rows: Float) -> Float:
+    """Return the mean of each row without its NaN, shape (B,); NaN where there is nothing else."""
+    known = np.isfinite(rows)
+    total, count = np.where(known, rows, 0.0).sum(axis=1), known.sum(axis=1)
+    return np.asarray(np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0))
 
 
 @dataclass(frozen=True)

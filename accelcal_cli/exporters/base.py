@@ -18,11 +18,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
 from accelcal_cli.schema import Checked, setting
-from accelcal_cli.sensor.model import (
-    STANDARD_GRAVITY,
-    ErrorModel,
-    sensitivity,
-)
+from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY, ErrorModel, sensitivity
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -166,5 +162,5 @@ def is_force(result: Calibration) -> bool:
 
 
 def metres_per_unit(result: Calibration) -> float:
-    """Return how many m/s^2 one unit of the calibrated force is: 9.80665 for g, else 1."""
-    return STANDARD_GRAVITY if result.unit == "g" else 1.0
+    """Return how many m/s^2 one unit of the calibrated force is: 9.80665 for g, 1 for m/s^2."""
+    return STANDARD_GRAVITY / OUTPUT_OF_1_G[result.unit]

@@ -7,22 +7,23 @@ name. An ambiguous table is an error that says what to state; columns are never 
 
 from __future__ import annotations
 
-import re
-from collections import defaultdict
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.reader import InputTable, RowBlock, Selection
+from accelcal_cli.io.roles import Roles, Triple, bare_name, listed, recognise
+from accelcal_cli.io.vocabulary import FORCE_UNITS, describe, name_unit, parse_unit
 
-Triple = tuple[int, int, int]
-Group = dict[str, tuple[list[int], list[int], list[int]]]
-"""Columns of each axis, by family of names; a second column of one name opens a second triple."""
+COUNTED = 16
+"""Digits from which on a time is read as an integer: a 64-bit float would round it."""
 
-AXES = "xyz"
+GUESSED = ("s", "ms", "us", "ns")
+"""Units of time that a step alone may tell."""
 
 NONE = "none"
 """Option value for no gyroscope, or no time."""
@@ -35,45 +36,14 @@ NAMELESS: dict[int, tuple[Triple, Triple | None, int | None]] = {
 }
 """Acceleration, gyroscope and time of a log without a header, by its number of columns."""
 
-SHOWN = 20
-"""Column names that a message lists at most."""
+RUNNING = 3
+"""Rows from which on a number that grows by one counts the rows."""
 
-_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
-_INDEX = re.compile(r"\[([012])\]\s*$")  # accelerometer_m_s2[0]
-_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
-_UNITS = re.compile(r"g|mg|ug|mps|mps2|ms|ms2|m|s|s2|2|lsb|counts|raw|mv|v|c|degc|celsius|k|pulse|pulses|hz")
-_MEAN = frozenset({"mean", "avg", "average"})
-_SPREAD = frozenset({"std", "sd", "sigma", "stdev", "stddev"})
-_SPREAD_GLUED = re.compile(r"(?:std|sd|sigma|s)([xyz])")
+FEWEST_ROWS, RAW_ENOUGH = 6, 500
+"""Rows from which on columns can be told by their length, and on which only the calmer half is looked at."""
 
-_ACCELERATION = ("acc", "accel", "acceleration", "accelerometer", "linearacceleration")
-_OUTPUT = ("a", *_ACCELERATION, "fieldlinearacceleration", "accsmooth", "n", "out", "output", "")
-_REFERENCE = ("f", "ref", "reference", "fref", "reff", "specificforce")
-_GYRO = (
-    *("w", "g", "gyr", "gyro", "gyroscope", "gyrorad"),
-    *("omega", "angvel", "angularvelocity", "rotationrate"),
-)
-_CAPITAL_T = re.compile(r"T(?:_?(?:deg)?[cCkK]|\s*[\[(]\s*(?!m?s\b).*)?")  # t would be time
-_ALONE = {
-    "temperature": re.compile(r"temperature|temp"),
-    "label": re.compile(
-        r"pose|poses|poseid|poselabel|posename|position|positionid|pos|label|orientation|face"
-    ),
-    "count": re.compile(r"n|count|counts|samples|nsamples|numsamples|npoints"),
-    "sensor": re.compile(
-        r"(?:sensor|device|serial|imu|accelerometer|dut|node|board|chip|module|unit|part)"
-        r"(?:id|no|nr|num|number|name|label|serial|serialno|serialnr|serialnumber|sn)|sensors?|device|serial|sn|imu|dut"
-    ),
-    "instance": re.compile(r"(?:imu|sensor|acc|accel)?instance(?:id|no|nr|num|number)?"),
-    "kind": re.compile(r"(?:sensor|data|msg|message)?(?:type|kind)|topic|channel|measurement"),
-    "other": re.compile(
-        r"|t|time|timestamp|stamp|start|end|stop|tstart|tend|starttime|endtime|index|row|sec|seconds|id"
-    ),
-}
-"""Roles of single columns, by their names without separators; those of `other` are not readings."""
-
-_TIME = re.compile(r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?")
-_SENSOR_PERHAPS = re.compile(r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer")
+CONSTANT = 0.15
+"""Part of its length by which acceleration at rest differs from gravity: errors of scale and bias."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +56,7 @@ class Columns:
         identity: columns whose values tell sensors apart, where no `sensor` is stated.
         count, scatter: raw readings behind a row, and the standard deviation of one of them.
         reference: known specific force; temperature, time, gyro: as their names say.
+        unit: of the output as the file states it: g, mg, m/s^2 or counts.
         notes: what a user should know.
     """
 
@@ -99,6 +70,7 @@ class Columns:
     temperature: int | None = None
     time: int | None = None
     gyro: Triple | None = None
+    unit: str | None = None
     identity: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -116,7 +88,7 @@ class Columns:
         """Return what to ask of the table; a standard deviation or temperature may be missing in a row."""
         gaps = frozenset((*(self.scatter or ()), *_present(self.temperature)))
         texts = (*_present(self.sensor, self.label), *self.identity)
-        return Selection((*self.output, *self.extras), gaps, texts)
+        return Selection((*self.output, *self.extras), gaps, texts, self.output)
 
     def split(self, extras: Float) -> tuple[Float | None, Float | None, Float]:
         """Split the values of `extras`, shape (B, k), into count (B,), scatter (B, 3) and the others (B, m)."""
@@ -148,7 +120,8 @@ class RawColumns:
 
     Attributes:
         output: the accelerometer; names: of its columns, or their numbers from 1.
-        gyro, time: None where there are none.
+        gyro, time, temperature: None where there are none.
+        unit: of the output as the file states it: g, mg, m/s^2 or counts.
         identity: columns whose values tell sensors apart.
         dated: `time` holds dates, not numbers.
         guessed: `time` is only time when it never decreases.
@@ -160,6 +133,8 @@ class RawColumns:
     names: tuple[str, str, str]
     gyro: Triple | None = None
     time: int | None = None
+    temperature: int | None = None
+    unit: str | None = None
     dated: bool = False
     guessed: bool = False
     doubtful: str = ""
@@ -167,41 +142,151 @@ class RawColumns:
     notes: tuple[str, ...] = ()
 
     def selection(self) -> Selection:
-        """Return what to ask of the table: acceleration, gyroscope, time; dates as text."""
-        sensors, time = (*self.output, *(self.gyro or ())), _present(self.time)
-        if self.dated:
-            return Selection(sensors, texts=(*time, *self.identity))
-        return Selection((*sensors, *time), texts=self.identity)
+        """Return what to ask of the table: acceleration, gyroscope, temperature, time; dates and identity as text."""
+        warm = _present(self.temperature)
+        sensors, time = (*self.output, *(self.gyro or ()), *warm), _present(self.time)
+        texts, numbers = (time, sensors) if self.dated else ((), (*sensors, *time))
+        return Selection(numbers, frozenset(warm), (*texts, *self.identity), self.output, frozenset(warm))
 
 
-def choose(table: InputTable, wanted: Sequence[str] | None = None, sensor: int | None = None) -> Columns:
+def choose(
+    table: InputTable,
+    wanted: Sequence[str] | None = None,
+    sensor: int | None = None,
+    count: str | None = None,
+) -> Columns:
     """Find the three output columns and the optional ones.
 
     Args:
         table: of static readings, open.
         wanted: the three output columns, by name or number from 1; None to go by the names.
         sensor: the column that labels the sensor, in a table of many sensors.
+        count: the column of counts, or "none"; None to go by the names.
 
     Raises:
         DataError: the table has no rows, or its columns are ambiguous. UsageError: `wanted` does not fit the table.
     """
     if not table.has_rows:
         raise DataError(f"{table.name}: has a header but no readings below it")
-    names = table.names
-    roles = recognise(names or ())
-    notes: tuple[str, ...] = ()
+    roles = recognise(table.names or ())
+    notes: list[str] = []
     if wanted is not None:
         output = parse_triple(table, [wanted] if isinstance(wanted, str) else wanted)
-    elif roles.families:
-        output = _only_family(table, roles)
     else:
-        output = _only_three(table, roles, sensor)
-        notes = (
-            f"no header: columns {_numbered(output)} taken as x, y, z"
-            if names is None
-            else f"columns {_listed(names, output)} taken as x, y, z: the only three that can be",
-        )
-    return _with_extras(table, output, roles, notes, sensor)
+        output, notes = _find_output(table, roles, sensor)
+    timed = roles.alone["time"] or [k for k in _with_unit(table, GUESSED) if k not in output]
+    roles.alone["time"] = [k for k in timed if _is_filled(table, k)] or timed
+    if count is not None:
+        roles.alone["count"] = [] if count.lower() == NONE else [find_column(table, count, "--count")]
+    else:
+        if not roles.scatter:  # rows that state their scatter are means, whatever their count
+            roles.alone["count"], more = _true_counts(table, roles.alone["count"])
+            notes += more
+    return _with_extras(table, output, roles, tuple(notes), sensor)
+
+
+def _find_output(table: InputTable, roles: Roles, sensor: int | None) -> tuple[Triple, list[str]]:
+    """Return the output columns, and what to say of how they were found: by name, by unit, by what is left."""
+    names = table.names
+    for families in (roles.families, roles.described):
+        if families:
+            stated = {
+                name: one for name, one in families.items() if unit_of_output(table, one) in FORCE_UNITS
+            }
+            return _only_family(table, roles, stated if len(stated) == 1 else families), []
+    by_unit = [k for k in _left(table, roles, sensor) if unit_of_output(table, (k, k, k)) in FORCE_UNITS]
+    if len(by_unit) == 3 and names is not None and table.facts.unit is None:
+        output = _in_order(names, by_unit)
+        return output, [
+            f"columns {listed(names, output)} taken as x, y, z: their unit is that of acceleration"
+        ]
+    left = _left(table, roles, sensor)
+    if len(left) == 3 or names is None or len(left) < 3:
+        output = _only_three(table, left)
+        if names is None:
+            return output, [f"no header: columns {_numbered(output)} taken as x, y, z"]
+        return output, [f"columns {listed(names, output)} taken as x, y, z: the only three that can be"]
+    runs = [(left[k], left[k + 1], left[k + 2]) for k in range(len(left) - 2)]
+    for triples in (list(roles.unknown.values()), runs):
+        constant = [triple for triple in triples if _is_gravity(table, triple)]
+        if len(constant) == 1:
+            output = constant[0]
+            return output, [
+                f"columns {listed(names, output)} taken as x, y, z: the only three whose length is constant at rest"
+            ]
+    return _only_three(table, left), []
+
+
+def _in_order(names: Sequence[str], columns: Sequence[int]) -> Triple:
+    """Return three columns by the letter or the number of their axis, as they come where they have none."""
+    meanings = [describe(names[k]) for k in columns]
+    places = [m.number if m.axis is None else m.axis for m in meanings]
+    known = [place for place in places if place is not None]
+    if len(set(known)) == 3:
+        columns = [column for _, column in sorted(zip(known, columns, strict=True))]
+    return columns[0], columns[1], columns[2]
+
+
+def unit_of_output(table: InputTable, output: Triple) -> str | None:
+    """Return the unit of three columns where the file states one and the same: g, mg, m/s^2 or counts."""
+    names, units = table.names, table.units
+    found = set()
+    for column in output:
+        unit = parse_unit(units[column]) if units is not None and column < len(units) else None
+        found.add(unit or (name_unit(names[column]) if names is not None else None))
+    if found == {None} and table.facts.unit:
+        return table.facts.unit
+    unit = found.pop() if len(found) == 1 else None
+    return unit if unit in (*FORCE_UNITS, "counts") else None
+
+
+def _with_unit(table: InputTable, units: Sequence[str]) -> list[int]:
+    """Return the columns whose names state one of some units."""
+    return [k for k, name in enumerate(table.names or ()) if name_unit(name) in units]
+
+
+def _is_filled(table: InputTable, column: int) -> bool:
+    """Return whether most cells of a column hold something."""
+    cells = [cells[column] for cells in table.preview()]
+    return 2 * sum(map(bool, cells)) >= len(cells)
+
+
+def _true_counts(table: InputTable, columns: list[int]) -> tuple[list[int], list[str]]:
+    """Return the columns of counts without those that number the rows from 0 or 1, and what to say of these."""
+    kept: list[int] = []
+    notes: list[str] = []
+    for column in columns:
+        values = [_value(cells[column]) for cells in table.preview()]
+        steps = np.diff(values) if len(values) >= RUNNING else np.zeros(1)
+        if values and values[0] in (0, 1) and (steps == steps[0]).all() and steps[0] > 0:
+            notes.append(f'column "{(table.names or ())[column]}" numbers the rows, so it is no count')
+        else:
+            kept.append(column)
+    return kept, notes
+
+
+def _value(cell: str) -> float:
+    try:
+        return float(cell.replace(",", "."))
+    except ValueError:
+        return math.nan
+
+
+def _is_gravity(table: InputTable, triple: Triple) -> bool:
+    """Return whether three columns are of constant length wherever they are still, in several directions."""
+    if not all(table.numeric[k] for k in triple):
+        return False
+    rows = np.array([[_value(cells[k]) for k in triple] for cells in table.preview()]).reshape(-1, 3)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) < FEWEST_ROWS:
+        return False
+    calm = np.abs(np.diff(rows, axis=0)).max(axis=1)
+    still = rows[1:][calm <= np.quantile(calm, 0.5)] if len(rows) > RAW_ENOUGH else rows
+    length = np.linalg.norm(still, axis=1)
+    middle = float(np.median(length))
+    off = np.quantile(np.abs(length - middle), 0.9)
+    turned = np.ptp(still, axis=0).max() > middle
+    return bool(middle > 0 and off < CONSTANT * middle and turned)
 
 
 def choose_raw(
@@ -227,10 +312,21 @@ def choose_raw(
     if time is not None:
         clock = None if time.lower() == NONE else find_column(table, time, "--time")
         raw = replace(raw, guessed=False, doubtful="")
+    warm = None if raw.temperature in (*(turning or ()), clock) else raw.temperature
     used = (*raw.output, *(turning or ()), *_present(clock))
     if len(set(used)) < len(used):
         raise UsageError("--columns, --gyro, --time: a column is asked for twice")
-    return replace(raw, gyro=turning, time=clock, dated=clock is not None and not table.numeric[clock])
+    return replace(
+        raw, gyro=turning, time=clock, temperature=warm, dated=clock is not None and _is_text(table, clock)
+    )
+
+
+def _is_text(table: InputTable, clock: int) -> bool:
+    """Return whether a time column has to be read as text: dates, clocks, and counts too long for a float."""
+    if not table.numeric[clock]:
+        return True
+    first = next((cells[clock] for cells in table.preview() if cells[clock]), "")
+    return first.isascii() and first.isdigit() and len(first) >= COUNTED
 
 
 def restrict(table: InputTable, where: Sequence[str]) -> None:
@@ -251,7 +347,7 @@ def restrict(table: InputTable, where: Sequence[str]) -> None:
         column = find_column(table, word.strip(), "--where")
         name = str(column + 1) if table.names is None else table.names[column]
         conditions.append(Condition(column, name, value.strip()))
-    table.filter = RowFilter(table.name, conditions)
+    table.keep_only(RowFilter(table.name, conditions))
 
 
 def sensor_column(table: InputTable, wanted: str | None = None) -> int:
@@ -268,12 +364,12 @@ def sensor_column(table: InputTable, wanted: str | None = None) -> int:
     candidates = roles.alone["sensor"] or roles.alone["perhaps sensor"]
     if len(candidates) > 1:
         raise DataError(
-            f"{table.name}: the sensor could be {_listed(names, candidates, ' or ')}; say which with {option}"
+            f"{table.name}: the sensor could be {listed(names, candidates, ' or ')}; say which with {option}"
         )
     if not candidates:
         raise DataError(
             f"{table.name}: no column that labels the sensor, such as sensor, serial, device or id; say which with "
-            f"{option} (there are {_listed(names, range(len(names)))}), or give one file per sensor"
+            f"{option} (there are {listed(names, range(len(names)))}), or give one file per sensor"
         )
     return candidates[0]
 
@@ -299,7 +395,7 @@ def parse_triple(table: InputTable, wanted: Sequence[str], option: str = "--colu
 def find_column(table: InputTable, word: str, option: str = "--columns") -> int:
     """Find a column by exact name, by name in any case or without its unit, or by number."""
     names, width = table.names, len(table.numeric)
-    for fold in (str, str.lower, _bare_name):
+    for fold in (str, str.lower, bare_name):
         matches = [k for k, name in enumerate(names or ()) if fold(name) == fold(word)]
         if len(matches) > 1:
             numbers = " or ".join(str(k + 1) for k in matches)
@@ -314,89 +410,29 @@ def find_column(table: InputTable, word: str, option: str = "--columns") -> int:
         raise UsageError(
             f'{option}: no column "{word}": {table.name} has no header; give numbers from 1 to {width}'
         )
-    hint = did_you_mean(word, names) or f"; there are {_listed(names, range(width))}"
+    hint = did_you_mean(word, names) or f"; there are {listed(names, range(width))}"
     raise UsageError(f'{option}: no column "{word}" in {table.name}{hint}')
 
 
-@dataclass
-class Roles:
-    """Columns by role, counted from 0; a triple is (x, y, z)."""
-
-    alone: defaultdict[str, list[int]] = field(
-        default_factory=lambda: defaultdict(list)
-    )  # by name of the role
-    families: dict[str, Triple] = field(default_factory=dict)  # candidates for the output, by their names
-    scatter: dict[str, Triple] = field(default_factory=dict)  # by family, "" for any
-    reference: Triple | None = None
-    gyro: Triple | None = None
-    doubtful: list[str] = field(default_factory=list)  # names that occur twice where one is needed
-    partial: list[str] = field(default_factory=list)  # triples that lack an axis, in words
-
-    def first(self, role: str) -> int | None:
-        """Return the first single column of a role."""
-        return next(iter(self.alone[role]), None)
-
-
-def recognise(names: Sequence[str]) -> Roles:
-    """Give every column its role by its name."""
-    roles = Roles()
-    groups: tuple[Group, Group, Group, Group] = ({}, {}, {}, {})
-    output, spread, reference, gyro = groups
-    for column, name in enumerate(names):
-        words = tokens_of(name)
-        key = "".join(words)
-        if _TIME.fullmatch(key):
-            roles.alone["time"].append(column)
-        if _SENSOR_PERHAPS.fullmatch(key):
-            roles.alone["perhaps sensor"].append(column)
-        if role := _role(name, key):
-            roles.alone[role].append(column)
-            continue
-        if axis := _spread(words, key):
-            _put(spread, axis, column)
-        for group, prefixes in ((reference, _REFERENCE), (output, _OUTPUT), (gyro, _GYRO)):
-            if not axis and (axis := _axis(key, prefixes)):
-                _put(group, axis, column)
-    roles.families = {_listed(names, triple): triple for _, triple in _triples(output)}
-    roles.doubtful = [names[column] for column in _left_over(output, 1)]
-    roles.scatter = dict(reversed(_triples(spread)))  # of two triples of one family the first stays
-    roles.reference = next((triple for _, triple in _triples(reference)), None)
-    roles.gyro = next((triple for _, triple in _triples(gyro)), None)
-    roles.partial = [
-        f'column "{names[k]}" not used: no {what} for all three axes'
-        for group, what in ((spread, "standard deviation"), (reference, "reference"))
-        for k in _left_over(group)
-    ]
-    return roles
-
-
-def tokens_of(name: str) -> list[str]:
-    """Return the words of a column name in lower case, without units and without "mean"."""
-    name = _INDEX.sub(lambda match: "_" + AXES[int(match[1])], re.sub(r"_?m_s_?2", "", name))
-    words = re.findall(r"[a-z0-9]+", _CAMEL.sub("_", _BRACKETS.sub(" ", name)).lower())
-    while len(words) > 1 and _UNITS.fullmatch(words[-1]):
-        words.pop()
-    return [word for word in words if word not in _MEAN] or words
-
-
-def _only_family(table: InputTable, roles: Roles) -> Triple:
-    if len(roles.families) > 1:
+def _only_family(table: InputTable, roles: Roles, families: dict[str, Triple]) -> Triple:
+    if len(families) > 1:
         raise DataError(
-            f"{table.name}: the readings could be {' or '.join(roles.families)}; say which with --columns"
+            f"{table.name}: the readings could be {' or '.join(families)}; say which with --columns"
         )
     if roles.doubtful:
         raise DataError(
             f'{table.name}: more than one column could be "{roles.doubtful[0]}"; '
             "say which to use with --columns and column numbers"
         )
-    return next(iter(roles.families.values()))
+    return next(iter(families.values()))
 
 
-def _only_three(table: InputTable, roles: Roles, sensor: int | None) -> Triple:
-    """Return the three columns whose names do not say that they are something else, if there are just three."""
+def _left(table: InputTable, roles: Roles, sensor: int | None) -> list[int]:
+    """Return the columns whose names do not say that they are something else than readings."""
     names, width = table.names, len(table.numeric)
     known = {
         *(roles.reference or ()),
+        *(roles.gyro or ()),
         *roles.alone["other"],
         *roles.alone["sensor"],
         *roles.alone["instance"],
@@ -406,8 +442,12 @@ def _only_three(table: InputTable, roles: Roles, sensor: int | None) -> Triple:
         *(column for triple in roles.scatter.values() for column in triple),
     }
     left = [k for k in range(width) if k not in known]
-    if names is not None and len(left) > 3:
-        left = [k for k in left if table.numeric[k]]
+    return left if names is None or len(left) <= 3 else [k for k in left if table.numeric[k]]
+
+
+def _only_three(table: InputTable, left: list[int]) -> Triple:
+    """Return the columns that are left, if they are just three."""
+    names, width = table.names, len(table.numeric)
     if len(left) == 3:
         twice = [names[k] for k in left if names[k]] if names is not None else []
         if len(set(twice)) < len(twice):
@@ -426,7 +466,7 @@ def _only_three(table: InputTable, roles: Roles, sensor: int | None) -> Triple:
         )
     raise DataError(
         f"{table.name}: no column names such as ax, ay, az; say which columns are x, y, z with --columns "
-        f"(there are {_listed(names, range(width))})"
+        f"(there are {listed(names, range(width))})"
     )
 
 
@@ -445,7 +485,7 @@ def _with_extras(
 
     shown = [names[k] if names is not None and names[k] else str(k + 1) for k in output]
     # The standard deviations of the output are those of its own family, or of none.
-    family = "" if names is None else _bare_name(names[output[0]])[:-1]
+    family = "" if names is None else bare_name(names[output[0]])[:-1]
     columns = Columns(
         output,
         (shown[0], shown[1], shown[2]),
@@ -457,17 +497,20 @@ def _with_extras(
         free("temperature"),
         free("time"),
         free_triple(roles.gyro),
+        unit_of_output(table, output),
         () if sensor is not None else _identity(roles, taken),
     )
+    if columns.unit is not None:
+        notes = (*notes, f"the readings are in {columns.unit} by the file")
     used = (*_present(sensor, columns.label), *columns.extras)
     if names is not None and used:
-        notes = (*notes, f"column{'s' * (len(used) > 1)} {_listed(names, used)} found")
+        notes = (*notes, f"column{'s' * (len(used) > 1)} {listed(names, used)} found")
     return replace(columns, notes=(*notes, *roles.partial))
 
 
 def is_kind(name: str) -> bool:
     """Return whether a column, by its name, holds kinds: of sensors perhaps, or of poses."""
-    return _role(name, "".join(tokens_of(name))) == "kind"
+    return bool(recognise((name,)).alone["kind"])
 
 
 def _identity(roles: Roles, taken: set[int | None]) -> tuple[int, ...]:
@@ -480,8 +523,17 @@ def _by_name(table: InputTable, wanted: Sequence[str] | None) -> RawColumns:
     """Go by the names of the columns, or, for a stated accelerometer, by what the names leave."""
     columns = choose(table, wanted)
     if table.names is not None:
-        identity = columns.identity
-        return RawColumns(columns.output, columns.names, columns.gyro, columns.time, identity=identity)
+        kept = [note for note in columns.notes if "taken as x, y, z" in note or "by the file" in note]
+        return RawColumns(
+            columns.output,
+            columns.names,
+            columns.gyro,
+            columns.time,
+            columns.temperature,
+            columns.unit,
+            identity=columns.identity,
+            notes=tuple(kept),
+        )
     guess = 0 if 0 not in columns.output and table.numeric[0] else None
     return RawColumns(columns.output, columns.names, time=guess, guessed=True)
 
@@ -506,60 +558,9 @@ def _by_width(table: InputTable) -> RawColumns:
     return RawColumns(output, names, gyro, time, guessed=time is not None, doubtful=doubtful, notes=(note,))
 
 
-def _role(name: str, key: str) -> str | None:
-    """Return the role of a single column, None for an axis and for an unknown name."""
-    if _CAPITAL_T.fullmatch(name.strip()):
-        return "temperature"
-    if name.strip() == "I":  # the instance, in the logs of ArduPilot
-        return "instance"
-    return next((role for role, pattern in _ALONE.items() if pattern.fullmatch(key)), None)
-
-
-def _axis(key: str, prefixes: Sequence[str]) -> tuple[str, str] | None:
-    """Return family and axis of a key such as accx, xacc or xaxis."""
-    if key[-1] in AXES and key[:-1] in prefixes:
-        return key[:-1], key[-1]
-    leading = key[0] in AXES and key[1:] in (*_ACCELERATION, "axis") and "a" in prefixes
-    return (key[1:], key[0]) if leading else None
-
-
-def _spread(words: Sequence[str], key: str) -> tuple[str, str] | None:
-    """Return family and axis of a standard deviation; family "" where the name has none."""
-    rest = "".join(word for word in words if word not in _SPREAD)
-    if rest and len(rest) < len(key):
-        return _axis(rest, _OUTPUT)
-    glued = _SPREAD_GLUED.fullmatch(key)
-    return ("", glued[1]) if glued else None
-
-
-def _put(group: Group, place: tuple[str, str], column: int) -> None:
-    family, axis = place
-    group.setdefault(family, ([], [], []))[AXES.index(axis)].append(column)
-
-
-def _triples(group: Group) -> list[tuple[str, Triple]]:
-    """Return family and columns of every triple that has all axes."""
-    return [(family, triple) for family, axes in group.items() for triple in zip(*axes, strict=False)]
-
-
-def _left_over(group: Group, least: int = 0) -> list[int]:
-    """Return the columns of incomplete triples; with `least` 1 those of a second triple and later ones alone."""
-    ends = (axis[max(least, min(map(len, axes))) :] for axes in group.values() for axis in axes)
-    return sorted(column for end in ends for column in end)
-
-
-def _listed(names: Sequence[str], columns: Sequence[int], between: str = ", ") -> str:
-    listed = between.join(f'"{names[k]}"' for k in columns[:SHOWN])
-    return listed + (f" and {len(columns) - SHOWN} more" if len(columns) > SHOWN else "")
-
-
 def _numbered(columns: Triple) -> str:
     return ", ".join(str(k + 1) for k in columns)
 
 
 def _present(*columns: int | None) -> tuple[int, ...]:
     return tuple(column for column in columns if column is not None)
-
-
-def _bare_name(name: str) -> str:
-    return "".join(tokens_of(name))

@@ -1,6 +1,7 @@
-"""How a text table is written: separator, decimal mark, header; `sniff` finds it from the first lines.
+"""How a text is written: separator, decimal mark, header, words between numbers; `understand` finds it from the head.
 
-The parsers of text.py and the writer of rewrite.py share the reading of one line that is defined here.
+The parsers of reader.py and the writer of rewrite.py share the reading of one line that is defined here; what stands
+above a table is told apart in preamble.py.
 """
 
 from __future__ import annotations
@@ -8,13 +9,22 @@ from __future__ import annotations
 import csv
 import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.lines import LineFilter, find_filter
+from accelcal_cli.io.preamble import AHEAD, LAYOUTS, Facts, find_layout, is_known, read_facts
 from accelcal_cli.io.stream import LONGEST_LINE
+from accelcal_cli.io.vocabulary import is_unit_row
 
 SAMPLE = 1000
 """Content lines that the dialect is found from."""
+
+SAMPLED = 64
+"""Lines that the separator is found from."""
+
+MARKS = ("#", "//", "%")
+"""What a line of comment begins with."""
 
 BOM = b"\xef\xbb\xbf"
 
@@ -26,20 +36,45 @@ FEWEST_THOUSANDS = 6
 """Cells such as 33,368 from which on they are thousands, where none says that the comma is a decimal mark."""
 
 
+_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->")
+"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``."""
+
+
+class ThousandsError(DataError):
+    """Commas separate thousands; no other reading of the text helps."""
+
+
 @dataclass(frozen=True)
 class Dialect:
-    """The form of a text table. `separator` " " stands for runs of blanks and tabs."""
+    """The form of a text table. `separator` " " stands for runs of blanks and tabs.
+
+    Attributes:
+        names: of the header, None where there is none; header_line: its number, 0 where it has none.
+        first: cells of the first data row, () where there is none.
+        top: the last line above the rows, 0 where they begin at once.
+        units: of the columns, by a row below the header.
+        above: lines of a preamble; facts: what they say.
+    """
 
     separator: str
     decimal_comma: bool
-    names: tuple[str, ...] | None  # of the header, None where there is none
-    header_line: int  # 0 where the first content line is data
-    first: tuple[str, ...]  # cells of the first data row, () where there is none
+    names: tuple[str, ...] | None
+    header_line: int
+    first: tuple[str, ...]
+    top: int = 0
+    units: tuple[str, ...] | None = None
+    above: int = 0
+    facts: Facts = field(default_factory=Facts)
 
     @property
     def width(self) -> int:
         """Cells a row must have."""
         return len(self.first if self.names is None else self.names)
+
+    @property
+    def marks(self) -> tuple[str, ...]:
+        """What a line of comment begins with."""
+        return MARKS if self.separator == ";" else (*MARKS, ";")
 
 
 def split_cells(line: str, separator: str) -> list[str]:
@@ -64,52 +99,154 @@ def looks_numeric(cell: str, decimal_comma: bool = True) -> bool:
     return True
 
 
-def sniff(head: bytes, source: str) -> Dialect:
-    """Find the dialect of a table from its first bytes; DataError, which names the `source`, for no text table."""
-    lines, comment = _sample(head, source)
+def understand(
+    head: bytes, source: str, skip: int = 0, prefix: str | None = None
+) -> tuple[LineFilter | None, Dialect]:
+    """Return the dialect of a text, and the filter of its lines where its numbers stand among words.
+
+    Args:
+        head: its first bytes; source: named in messages; skip: lines at its beginning that are not looked at.
+        prefix: what the lines of readings begin with, None to find them.
+
+    Raises:
+        DataError: neither a table nor lines of readings.
+    """
+    dialect: Dialect | None = None
+    fault: DataError | None = None
+    if prefix is None:
+        try:
+            dialect = sniff(head, source, skip)
+        except ThousandsError:
+            raise
+        except DataError as problem:
+            fault = problem
+        if dialect is not None and not _is_worded(dialect):
+            return None, dialect
+    lines = head[: 1 << 18].decode(errors="replace").splitlines()[skip:]
+    found = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
+    if found is None:
+        if dialect is None:
+            raise fault or DataError(f"{source}: no line has three numbers; readings were expected")
+        return None, dialect
+    dialect = sniff(found.translate(head), source, skip)
+    units = found.kind.units if any(found.kind.units) else None
+    if found.kind.names is not None:
+        dialect = replace(dialect, names=found.kind.names, header_line=0)
+    return found, replace(dialect, units=units, above=0)
+
+
+def _is_worded(dialect: Dialect) -> bool:
+    """Return whether words stand between the numbers of a line rather than above them."""
+    numbers = sum(looks_numeric(cell) for cell in dialect.first)
+    cells = dialect.first if dialect.header_line == 0 else dialect.names or ()
+    marked = any(_MARKED.fullmatch(cell) for cell in cells)
+    return marked or (dialect.header_line == 0 and numbers < 3)
+
+
+def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:
+    """Find the dialect of a table from its first bytes; the first `skip` lines are not looked at.
+
+    Raises:
+        DataError: no text table; the message names the `source`.
+    """
+    lines, comments = _sample(head, source, skip)
     if not lines:
         raise DataError(f"{source}: is empty; readings were expected, one row per pose")
     texts = [text for _, text in lines]
-    separator = _separator(texts[1:] or texts)
-    number, opening = lines[0]
-    cells = _header_cells(opening, separator)
-    names: tuple[str, ...] | None = None
-    if _is_header(cells, split_cells(texts[1], separator) if len(texts) > 1 else []):
-        names, texts = tuple(cells), texts[1:]
-    first = split_cells(texts[0], separator) if texts else []
+    dense = _dense(texts[1:] or texts)[-SAMPLED:]
+    separator = _separator(dense)
+    if separator == " " and _names_tabs(texts, dense):
+        separator = "\t"
+    rows = [split_cells(text, separator) for text in texts]
+    layout = find_layout(rows, looks_numeric, lambda k: _other_cells(texts[k], separator))
+    first = rows[layout.first] if layout.first < len(rows) else []
+    numbers = [number for number, _ in lines]
+    names, header = layout.names, 0 if layout.header is None else numbers[layout.header]
+    titles = (layout.header is not None) + (layout.units is not None)
+    above = [text for _, text in lines[: layout.first]]
+    remarks = [text for number, text in comments if not first or number < numbers[layout.first]]
+    facts = read_facts([*remarks, *above])
+    if layout.rate is not None:
+        facts = replace(facts, rate=layout.rate, start=texts[0].split(separator)[0].strip())
+    units = layout.units
     if names is None:
-        number = 0
         first = _without_tail(first)
-        names = _names_of_comment(comment, separator, len(first))
+        names, remarked = _names_of_comments(remarks, separator, len(first))
+        units = units or remarked
+        names = names or LAYOUTS.get((facts.device, len(first)))
     elif len(first) != len(names) or not first[-1]:
         names = tuple(_without_tail(list(names)))
-    decimal_comma = _decimal_comma(texts, separator)
+    rows_of_data = texts[layout.first :]
+    decimal_comma = _decimal_comma(rows_of_data, separator)
     if decimal_comma:
-        _refuse_thousands(texts, separator, source)
-    return Dialect(separator, decimal_comma, names, number, tuple(first))
+        _refuse_thousands(rows_of_data, separator, source)
+    return Dialect(
+        separator,
+        decimal_comma,
+        names,
+        header,
+        tuple(first),
+        max(skip, numbers[layout.first] - 1 if first else numbers[-1]) if layout.first or skip else 0,
+        units,
+        len(above) - titles,
+        facts,
+    )
 
 
-def _sample(head: bytes, source: str) -> tuple[list[tuple[int, str]], str]:
-    """Return the first content lines with their numbers, and the last comment line before them."""
+def _sample(head: bytes, source: str, skip: int) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
+    """Return the first content lines and the comments, with their numbers."""
     lines: list[tuple[int, str]] = []
-    comment = ""
+    comments: list[tuple[int, str]] = []
     for number, raw in enumerate(io.BytesIO(head.removeprefix(BOM)), 1):
+        if number <= skip:
+            continue
         text = decode_line(raw, number, source, strict=not lines).strip("\r\n")
-        if text.lstrip().startswith("#"):
-            comment = comment if lines else text.lstrip()[1:]
+        if is_comment(text, MARKS):
+            if len(comments) < SAMPLE:
+                comments.append((number, text.lstrip().lstrip("#/%").strip()))
         elif not is_blank(text):
             lines.append((number, text))
         if len(lines) == SAMPLE:
             break
     if len(lines) > 2 and not head.endswith(b"\n"):
         lines.pop()  # the head may end within a line
-    return lines, comment
+    semicolons = [text.lstrip().startswith(";") for _, text in lines]
+    if any(semicolons) and not any(";" in text.lstrip()[1:] for _, text in lines[-AHEAD:]):
+        comments += [line for line, mark in zip(lines, semicolons, strict=True) if mark]
+        lines = [line for line, mark in zip(lines, semicolons, strict=True) if not mark]
+    return lines, comments
+
+
+def is_comment(line: str, marks: tuple[str, ...]) -> bool:
+    """Return whether a line begins with one of the marks of a comment."""
+    return line.lstrip().startswith(marks)
+
+
+def _dense(lines: list[str]) -> list[str]:
+    """Return the lines that are mostly digits, where such lines end a sample: the others stand above a table."""
+    dense = [2 * sum(c.isdigit() for c in line) >= len("".join(line.split())) for line in lines]
+    if 2 * sum(dense[-12:]) < len(dense[-12:]):
+        return lines
+    return [line for line, yes in zip(lines, dense, strict=True) if yes]
+
+
+def _names_tabs(lines: list[str], rows: list[str]) -> bool:
+    """Return whether a line without numbers has as many cells between tabs as the last row, empty ones included."""
+    width = rows[-1].count("\t")
+    titles = (line for line in lines if line.count("\t") == width > 1)
+    return any(not any(map(looks_numeric, line.split("\t"))) for line in titles)
+
+
+def _other_cells(line: str, separator: str) -> list[list[str]]:
+    """Return the cells of a header as other separators than that of the rows divide it."""
+    forms = [_header_cells(line, separator), re.split(r"\t+|\s{2,}", line.strip())]
+    return forms + [split_cells(line, other) for other in (",", ";", "\t", "|") if other != separator]
 
 
 def is_blank(line: str) -> bool:
     """Return whether a line is blanks and separators only, or the note `sep=;`: spreadsheets leave both."""
-    rest = line.strip(" \t\r\n,;")
-    return not rest or rest.lower() == "sep="
+    rest = line.strip(' \t\r\n,;|"')
+    return not rest or rest.lower() in ("sep=", "sep")
 
 
 def decode_line(raw: bytes, number: int, source: str, *, strict: bool = True) -> str:
@@ -129,7 +266,7 @@ def decode_line(raw: bytes, number: int, source: str, *, strict: bool = True) ->
 
 def _separator(lines: list[str]) -> str:
     """Return the separator of the data lines: the one under which the largest share of cells are numbers."""
-    bare = [_QUOTED.sub("0", line.strip("\r\n")) for line in lines[:64]]
+    bare = [_QUOTED.sub("0", line.strip("\r\n")) for line in lines]
     best, share = " ", -1.0
     for separator in (";", "\t", ",", " "):
         rows = [split_cells(line, separator) for line in bare]
@@ -168,7 +305,7 @@ def _decimal_comma(lines: list[str], separator: str) -> bool:
 
 
 def _refuse_thousands(lines: list[str], separator: str, source: str) -> None:
-    """Raise DataError where commas separate thousands, as in 33,368, which a decimal comma would read as 33.368.
+    """Raise ThousandsError where commas separate thousands, as in 33,368, which a decimal comma would read as 33.368.
 
     Fractions of three digits are told from thousands by cells such as 0,012: no number with thousands begins so.
     """
@@ -177,7 +314,7 @@ def _refuse_thousands(lines: list[str], separator: str, source: str) -> None:
     if len(numbers) < FEWEST_THOUSANDS or not all(_THOUSANDS.fullmatch(cell) for cell in numbers):
         return
     shown = numbers[0]
-    raise DataError(
+    raise ThousandsError(
         f'{source}: "{shown}" has a thousands separator, it seems, as have all numbers with a comma: a decimal comma '
         f"would make it {shown.replace(',', '.', 1)}; save the table without thousands separators "
         f"({shown.replace(',', '')}), or, if the comma is a decimal mark, with decimal points"
@@ -190,22 +327,24 @@ def _header_cells(line: str, separator: str) -> list[str]:
     return re.split(r"\s+(?![\[(])", line.strip()) if aligned else split_cells(line, separator)
 
 
-def _is_header(cells: list[str], second: list[str]) -> bool:
-    if not any(looks_numeric(cell) for cell in cells):
-        return True
-    # column numbers from zero, as data-frame libraries write for a nameless array, above rows of fractions
-    tail = cells[1:] if not cells[0] else cells
-    counting = tail == [str(k) for k in range(len(tail))]
-    return counting and len(second) == len(cells) and all("." in cell for cell in second[-len(tail) :])
-
-
 def _without_tail(cells: list[str]) -> list[str]:
     """Return the cells without the empty one that a separator at the end of the line makes."""
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
 
 
-def _names_of_comment(comment: str, separator: str, width: int) -> tuple[str, ...] | None:
-    """Return the names in a comment line above the data, if it has one word for each column."""
-    cells = _header_cells(comment, separator)
-    fits = len(cells) == width > 1 and all(cells) and not any(looks_numeric(cell) for cell in cells)
-    return tuple(cells) if fits else None
+def _names_of_comments(
+    comments: list[str], separator: str, width: int
+) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
+    """Return names and units in comment lines above the data, the last of each with one word for each column."""
+    names: tuple[str, ...] | None = None
+    units: tuple[str, ...] | None = None
+    for comment in reversed(comments):
+        for cells in (_header_cells(comment, separator), *_other_cells(comment, separator)):
+            if not (len(cells) == width > 1 and all(cells)) or any(looks_numeric(cell) for cell in cells):
+                continue
+            if is_unit_row(cells) and units is None:
+                units = tuple(cells)
+            elif names is None and is_known(cells):
+                names = tuple(cells)
+            break
+    return names, units

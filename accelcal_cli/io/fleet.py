@@ -18,8 +18,8 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict, sensor_column
-from accelcal_cli.io.reader import InputTable, RowBlock, open_table
-from accelcal_cli.io.readings import LabelledMeans, Readings, number_labels
+from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
 from accelcal_cli.io.rows import ZeroRows, add_stretches, places, zero_rows
 from accelcal_cli.io.screening import LOOKED_AT, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
@@ -48,7 +48,7 @@ class TableOrigin:
         name: as given; sha256: of its bytes; columns: names of its output columns.
         first: number of its first pose among those of all tables.
         where: how to name one of its poses, counted from 0.
-        notes: what the reader did that a user should know.
+        notes: what the reader did that a user should know; form: how the table is written.
         rows: whether each row, not each label, is a pose; timed: whether the rows have times.
     """
 
@@ -58,6 +58,7 @@ class TableOrigin:
     first: int
     where: Callable[[int], str]
     notes: tuple[str, ...]
+    form: InputForm
     rows: bool
     timed: bool
 
@@ -107,6 +108,12 @@ class FleetReadings:
     _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
     zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
+    @property
+    def unit(self) -> str | None:
+        """Unit of the readings where all tables state the same."""
+        units = {origin.form.unit for origin in self.origins}
+        return units.pop() if len(units) == 1 else None
+
     def origin(self, pose: int) -> TableOrigin:
         """Return the table that a pose came from, by its number among all."""
         return self.origins[bisect.bisect_right(self.origins, pose, key=lambda origin: origin.first) - 1]
@@ -127,7 +134,13 @@ class FleetReadings:
             scatter=_known(batch.scatter, at, count),
             cross=_known(batch.cross, at, count),
             warnings=self.warnings(batch, at),
-        ).known_as(origin.sha256, origin.columns, origin.notes, lambda pose: self.where(int(poses[pose])))
+        ).known_as(
+            origin.sha256,
+            origin.columns,
+            origin.notes,
+            lambda pose: self.where(int(poses[pose])),
+            form=origin.form,
+        )
 
     def warnings(self, batch: Batch, at: int) -> tuple[Notice, ...]:
         """Return why the readings of the sensor at `at` in a batch may not be poses."""
@@ -235,7 +248,7 @@ def read_fleet(
     sensor: str | None = None,
     *,
     stdin: BinaryIO | None = None,
-    where: Sequence[str] = (),
+    options: ReadOptions = PLAIN,
 ) -> FleetReadings:
     """Read the static readings of many sensors; ``-`` is standard input.
 
@@ -254,10 +267,10 @@ def read_fleet(
     names = _file_names(sources) if each else [None] * len(sources)
     collector = _FleetCollector()
     for source, name in zip(sources, names, strict=True):
-        table = open_table(source, stdin)
+        table = open_table(source, stdin, options=options)
         try:
-            restrict(table, where)
-            collector.read(table, columns, sensor, name)
+            restrict(table, options.where)
+            collector.read(table, columns, sensor, name, options.count)
         finally:
             table.close()
     label = collector.origins[0].name if len(sources) == 1 else f"{len(sources)} files"
@@ -294,20 +307,26 @@ class _FleetCollector:
     zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     def read(
-        self, table: InputTable, wanted: Sequence[str] | None, sensor: str | None, name: str | None
+        self,
+        table: InputTable,
+        wanted: Sequence[str] | None,
+        sensor: str | None,
+        name: str | None,
+        counts: str | None = None,
     ) -> None:
         """Read one table: of the sensor `name`, or of many."""
         first = self.store.rows
         column = sensor_column(table, sensor) if name is None else own_sensor_column(table)
-        columns = choose(table, wanted, column)
+        columns = choose(table, wanted, column, counts)
         if column in columns.output:
             shown = columns.names[columns.output.index(column)]
             raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
         means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
-        zeros, idle = ZeroRows(), dict[int, list[int]]()
+        zeros, idle, rows_read = ZeroRows(), dict[int, list[int]](), 0
         for rows in table.blocks(columns.selection()):
             if not len(rows.numbers):
                 continue
+            rows_read += len(rows.numbers)
             columns.check(table, rows)
             labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
             codes = number_labels(self.index, labels)
@@ -336,7 +355,8 @@ class _FleetCollector:
                 columns.names,
                 first,
                 place if means is None else _by_label([label for _, label in means.index]),
-                columns.notes if columns.temperature is None else (*columns.notes, COLD),
+                (*table.notes, *columns.notes, *(() if columns.temperature is None else (COLD,))),
+                InputForm(table.source_format, rows_read, table.rows_skipped, None, columns.unit),
                 rows=means is None,
                 timed=columns.time is not None,
             )

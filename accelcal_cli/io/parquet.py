@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.preamble import Facts
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.rows import RowFilter
@@ -21,11 +22,19 @@ from accelcal_cli.io.stream import BackgroundThread, ByteSource
 ROWS = 500_000
 """Rows of a block."""
 
+PREVIEW = 2000
+"""Rows that the columns are told by where their names do not."""
+
 
 class ParquetTable:
     """A Parquet file, streamed a batch of rows at a time."""
 
     has_rows: bool
+    units: tuple[str, ...] | None = None
+    facts = Facts()
+    source_format = "parquet"
+    notes: tuple[str, ...] = ()
+    rows_skipped = 0
 
     def __init__(self, source: ByteSource, path: Path | None) -> None:
         """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
@@ -53,6 +62,17 @@ class ParquetTable:
         """SHA-256 of the file."""
         self._hashing.wait()
         return self._source.sha256
+
+    def preview(self) -> list[list[str]]:
+        """Return the cells of those of the first rows that are read."""
+        with _named_errors(self.name):
+            frame = pl.scan_parquet(self._path).head(PREVIEW).collect()
+        rows = (["" if cell is None else str(cell) for cell in row] for row in frame.iter_rows())
+        return [cells for cells in rows if self.filter is None or self.filter.meets(cells)]
+
+    def keep_only(self, rows: RowFilter) -> None:
+        """Read only those rows."""
+        self.filter = rows
 
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns."""

@@ -7,7 +7,6 @@ mean the same. Short inputs never import polars. Parquet has its own file, which
 
 from __future__ import annotations
 
-import bisect
 import io
 import math
 from array import array
@@ -18,10 +17,23 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 
-from accelcal_cli.arrays import Float, Int
+from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.dialect import BOM, Dialect, decode_line, is_blank, looks_numeric, sniff, split_cells
-from accelcal_cli.io.stream import ByteSource, open_source
+from accelcal_cli.io.dialect import (
+    BOM,
+    MARKS,
+    SAMPLE,
+    Dialect,
+    decode_line,
+    is_blank,
+    is_comment,
+    looks_numeric,
+    split_cells,
+    understand,
+)
+from accelcal_cli.io.preamble import Facts
+from accelcal_cli.io.skipped import LineMap, PassedLines
+from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
 
 if TYPE_CHECKING:
     import polars as pl
@@ -36,6 +48,33 @@ SHOWN = 40
 
 NO_LABEL = "is empty; every row needs its label"
 
+MOST_BAD = 0.05
+"""Part of the rows that --skip-bad leaves out at most."""
+
+SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a user states about the form of a table.
+
+    Attributes:
+        skip_rows: lines at its beginning that are not looked at.
+        skip_bad: leave out rows that cannot be read, up to MOST_BAD of them.
+        line: what the lines of readings begin with, among lines of several kinds; None to find them by their words.
+        count: the column of counts, or ``none``; None to find it by its name.
+        where: conditions that the rows to read meet, each as COLUMN=VALUE.
+    """
+
+    skip_rows: int = 0
+    skip_bad: bool = False
+    line: str | None = None
+    count: str | None = None
+    where: tuple[str, ...] = ()
+
+
+PLAIN = ReadOptions()
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -44,6 +83,8 @@ class Selection:
     numbers: tuple[int, ...]
     gaps: frozenset[int] = frozenset()  # columns whose cells may be empty or nan
     texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
+    needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
+    carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +122,32 @@ class InputTable(Protocol):
         """Whether there is anything below the header."""
 
     @property
+    def units(self) -> tuple[str, ...] | None:
+        """Units of the columns, where a row below the header states them."""
+
+    @property
+    def facts(self) -> Facts:
+        """What stands above the table."""
+
+    @property
+    def source_format(self) -> str:
+        """How the input is written, as ``text, comma, gzip`` or ``parquet``."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was skipped, in sentences; complete once all blocks have been read."""
+
+    @property
+    def rows_skipped(self) -> int:
+        """Rows left out as broken so far."""
+
+    def preview(self) -> list[list[str]]:
+        """Return the cells of some of the first rows that are read."""
+
+    def keep_only(self, rows: RowFilter) -> None:
+        """Read only those rows."""
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the input, once all blocks have been read."""
 
@@ -95,15 +162,21 @@ class InputTable(Protocol):
         """Release the file."""
 
 
-def open_table(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bool = True) -> InputTable:
+def open_table(
+    source: str | Path,
+    stdin: BinaryIO | None = None,
+    *,
+    hashed: bool = True,
+    options: ReadOptions = PLAIN,
+) -> InputTable:
     """Open a table of any supported form; ``-`` is standard input. Without the hash it is read a little faster."""
     stream, path = open_source(source, stdin, hashed=hashed), None if str(source) == "-" else Path(source)
     try:
         if stream.head.startswith(b"PAR1") or (path and path.suffix.lower() in {".parquet", ".pq"}):
             from accelcal_cli.io.parquet import ParquetTable
 
-            return ParquetTable(stream, path)
-        return TextTable(stream)
+            return ParquetTable(stream, None if stream.forms else path)
+        return TextTable(stream, options)
     except BaseException:
         stream.close()
         raise
@@ -112,16 +185,17 @@ def open_table(source: str | Path, stdin: BinaryIO | None = None, *, hashed: boo
 class TextTable:
     """A table in text form."""
 
-    def __init__(self, source: ByteSource) -> None:
+    def __init__(self, source: ByteSource, options: ReadOptions = PLAIN) -> None:
         """Find the dialect of `source` from its head."""
         self.name = source.name
-        self.dialect = sniff(source.head, source.name)
-        self.names = self.dialect.names
+        self._source, self._options = source, options
+        self._words, self.dialect = understand(source.head, source.name, options.skip_rows, options.line)
+        self.names, self.units, self.facts = self.dialect.names, self.dialect.units, self.dialect.facts
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
         self.has_rows = bool(self.dialect.first)
+        self.passed = PassedLines()
         self.filter: RowFilter | None = None
-        self._source = source
         self._lines = LineMap()
 
     @property
@@ -129,25 +203,80 @@ class TextTable:
         """SHA-256 of the bytes read so far."""
         return self._source.sha256
 
+    @property
+    def source_format(self) -> str:
+        """How the text is written."""
+        form = "words" if self._words else SEPARATORS[self.dialect.separator]
+        return ", ".join(
+            ["text", form, *(["decimal comma"] * self.dialect.decimal_comma), *self._source.forms]
+        )
+
+    @property
+    def rows_skipped(self) -> int:
+        """Rows left out as broken so far."""
+        return len(self.passed.bad) + (self.passed.cut is not None)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was skipped, in sentences; complete once all blocks have been read."""
+        above, facts = self.dialect.above, str(self.facts)
+        notes = [f"read as {' in '.join(reversed(self._source.forms))}"] * bool(self._source.forms)
+        if self._options.skip_rows:
+            notes.append(f"the first {self._options.skip_rows:,} lines skipped (--skip-rows)")
+        if above or facts:
+            plural = "s" * (above != 1)
+            notes.append(
+                (f"{above:,} line{plural} above the table skipped" if above else "comments")
+                + f": {facts}" * bool(facts)
+            )
+        if self._words is not None and (note := self._words.note()):
+            notes.append(note)
+        return (*notes, *self.passed.notes())
+
+    def preview(self) -> list[list[str]]:
+        """Return the cells of some rows of the head that are read, spread over it."""
+        head = self._source.head if self._words is None else self._words.translate(self._source.head)
+        lines = head.splitlines()[self.dialect.top :]
+        step = max(1, len(lines) // (2 * SAMPLE)) if len(lines) > 2 * SAMPLE else 1
+        texts = [line.decode(errors="replace") for line in lines[::step]]
+        rows = (
+            split_cells(text, self.dialect.separator)
+            for text in texts
+            if not is_comment(text, self.dialect.marks)
+        )
+        whole = (cells for cells in rows if len(cells) >= self.dialect.width)
+        return [cells for cells in whole if self.filter is None or self.filter.meets(cells)]
+
+    def keep_only(self, rows: RowFilter) -> None:
+        """Read only those rows, which may hold numbers where the first row of the table holds none."""
+        self.filter = rows
+        first = next(iter(self.preview()), None)
+        if first is not None:
+            self.numeric = tuple(looks_numeric(cell) for cell in first[: self.dialect.width])
+
     def blocks(self, selection: Selection) -> Iterator[RowBlock]:
         """Read the selected columns; short inputs never import polars."""
         return (rows for _, rows in self.pairs(selection))
 
     def pairs(self, selection: Selection) -> Iterator[tuple[bytes, RowBlock]]:
         """Read blocks of whole lines, each with the selected columns of its rows."""
-        careful = CarefulParser(self.name, self.dialect, selection, self.filter)
-        self._lines = careful.lines
+        careful = CarefulParser(
+            self.name, self.dialect, selection, self.filter, lenient=self._options.skip_bad
+        )
+        self._lines, self.passed = careful.lines, careful.passed
         parse = careful.parse if self._source.whole else FastParser(careful).parse
-        for block in self._source.blocks():
-            top = _top(block, self.dialect.header_line) if careful.line == 0 else 0
-            if top and (kept := self._filtered(block[:top], top=self.dialect.header_line > 0)):
+        for raw in self._source.blocks():
+            block = raw if self._words is None else self._words.translate(raw)
+            top = _top(block, self.dialect.top) if careful.line == 0 else 0
+            if top and (kept := self._kept(block[:top], top=self.dialect.top > 0)):
                 yield kept, careful.parse(kept)
-            if top < len(block) and (kept := self._filtered(block[top:])):
+            if top < len(block) and (kept := self._kept(block[top:])):
                 yield kept, parse(kept)
         if self.filter is not None:
             self.filter.check()
+        careful.check_passed()
 
-    def _filtered(self, block: bytes, *, top: bool = False) -> bytes:
+    def _kept(self, block: bytes, *, top: bool = False) -> bytes:
         if self.filter is None:
             return block
         return self.filter.keep_all(block) if top else self.filter.keep(block, self.dialect)
@@ -165,38 +294,6 @@ class TextTable:
         self._source.close()
 
 
-@dataclass
-class LineMap:
-    """Line number of every row, kept as the places where lines and rows diverge (blank lines, comments)."""
-
-    rows: array[int] = field(default_factory=lambda: array("q"))
-    lines: array[int] = field(default_factory=lambda: array("q"))
-
-    def add(self, row: int, line: int) -> None:
-        """Note that `row` (from 0) is on `line` (from 1); the rows after it follow line by line."""
-        if not self.rows or line - row != self.lines[-1] - self.rows[-1]:
-            self.rows.append(row)
-            self.lines.append(line)
-
-    def add_many(self, rows: Int, lines: Int) -> None:
-        """Note that each of some rows, ascending, is on its line."""
-        if not len(rows):
-            return
-        self.add(int(rows[0]), int(lines[0]))
-        breaks = np.flatnonzero(np.diff(lines - rows)) + 1
-        self.rows.frombytes(rows[breaks].astype(np.int64).tobytes())
-        self.lines.frombytes(lines[breaks].astype(np.int64).tobytes())
-
-    def line(self, row: int) -> int:
-        """Return the line number of a row."""
-        k = bisect.bisect_right(self.rows, row) - 1
-        return self.lines[k] + row - self.rows[k]
-
-    def where(self, row: int) -> str:
-        """Return how to name a row: ``line 8``."""
-        return f"line {self.line(row)}"
-
-
 @dataclass(eq=False)
 class CarefulParser:
     """Parses text blocks of one dialect row by row, and keeps count of rows and lines across blocks."""
@@ -208,24 +305,83 @@ class CarefulParser:
     lines: LineMap = field(default_factory=LineMap)
     row: int = 0  # rows so far
     line: int = 0  # lines so far
+    lenient: bool = False  # leave out broken rows
+    passed: PassedLines = field(default_factory=PassedLines)
+    last: dict[int, float] = field(default_factory=dict)  # values of the columns that are carried on
+
+    def __post_init__(self) -> None:
+        """Let lines that are no rows be named by their numbers in the input."""
+        self.passed.kept = None if self.filter is None else self.filter.lines
 
     def parse(self, block: bytes) -> RowBlock:
         """Return the rows of a block of whole lines; the first wrong cell raises DataError."""
-        start, values = self.row, array("d")
+        start, values, top = self.row, array("d"), max(self.dialect.top, self.dialect.header_line)
         texts: tuple[list[str], ...] = tuple([] for _ in self.selection.texts)
         for raw in io.BytesIO(block):
             self.line += 1
-            line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self._line(), self.source)
-            if is_blank(line) or line.lstrip().startswith("#") or self.line == self.dialect.header_line:
+            if self.line <= top:
                 continue
-            cells = self._cells(line)
+            try:
+                parts = self._parts(raw)
+            except DataError:
+                if self._is_passed(raw):
+                    continue
+                raise
+            if parts is None:
+                continue
             self.lines.add(self.row, self.line)
-            values.extend([self._number(cells[column], column) for column in self.selection.numbers])
-            for text, column in zip(texts, self.selection.texts, strict=True):
-                text.append(self._label(cells[column], column))
+            values.extend(parts[0])
+            for text, label in zip(texts, parts[1], strict=True):
+                text.append(label)
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
         return RowBlock(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+
+    def check_passed(self) -> None:
+        """Refuse a table of which too many rows are broken."""
+        bad = len(self.passed.bad)
+        if bad > MOST_BAD * (bad + self.row):
+            raise DataError(
+                f"{self.source}: {bad:,} of {bad + self.row:,} rows are broken, more than the {MOST_BAD:.0%} that "
+                f"--skip-bad leaves out: {self.passed.named(self.passed.bad)}"
+            )
+
+    def _parts(self, raw: bytes) -> tuple[list[float], list[str]] | None:
+        """Return numbers and texts of a line, None for one that is no row."""
+        line = decode_line(raw.removeprefix(BOM) if self.line == 1 else raw, self._line(), self.source)
+        if is_blank(line) or is_comment(line, self.dialect.marks):
+            return None
+        cells = self._cells(line)
+        selection, needed = self.selection, self.selection.needed
+        if self.dialect.header_line and self._is_header(cells):
+            self.passed.headers.append(self.line)
+            return None
+        for column in selection.carried:
+            if (value := to_number(cells[column], self.dialect.decimal_comma)) is not None:
+                self.last[column] = value
+        if needed and not any(cells[column] for column in needed):
+            self.passed.merged += 1
+            return None
+        numbers = [self._number(cells[column], column) for column in selection.numbers]
+        return numbers, [self._label(cells[column], column) for column in selection.texts]
+
+    def _is_header(self, cells: Sequence[str]) -> bool:
+        """Return whether a row repeats the header or the units below it."""
+        names, units = self.dialect.names or (), self.dialect.units or ()
+        return tuple(cells) == names or (bool(units) and tuple(cells) == units[: len(cells)])
+
+    def _is_passed(self, raw: bytes) -> bool:
+        """Return whether a line that cannot be read is left out: one that power-off cut, or any on request."""
+        if not raw.endswith(b"\n") and len(raw) <= LONGEST_LINE and self._is_cut(raw):
+            self.passed.cut = self.line
+            return True
+        if self.lenient:
+            self.passed.bad.append(self.line)
+        return self.lenient
+
+    def _is_cut(self, raw: bytes) -> bool:
+        cells = split_cells(raw.decode(errors="replace").strip("\0\r\n"), self.dialect.separator)
+        return bool(self.row) and (b"\0" in raw or len(cells) < self.dialect.width)
 
     def skip(self, rows: int) -> int:
         """Note that `rows` rows were read elsewhere, one per line; return the number of the first."""
@@ -256,6 +412,8 @@ class CarefulParser:
         value = to_number(cell, self.dialect.decimal_comma)
         if value is not None and -LIMIT <= value <= LIMIT:
             return value
+        if not cell and column in self.last:
+            return self.last[column]
         if column in self.selection.gaps and (not cell or (value is not None and math.isnan(value))):
             return math.nan
         raise DataError(f"{self._place(column)}: {_describe_cell(cell, value, self.dialect.decimal_comma)}")
@@ -305,7 +463,8 @@ class FastParser:
         dialect, selection = self.careful.dialect, self.careful.selection
         twice = not set(selection.texts).isdisjoint(selection.numbers)
         comma = dialect.decimal_comma and (b"." in block or dialect.separator == ",")
-        odd = b"#" in block or b"\0" in block or not block.endswith(b"\n")
+        marked = any(mark.encode() in block for mark in MARKS) or (dialect.separator != ";" and b";" in block)
+        odd = marked or b"\0" in block or not block.endswith(b"\n")
         if twice or comma or odd or not (block.isascii() or _is_utf8(block)):
             return None
         block = block.replace(b"\r\n", b"\n")
@@ -387,10 +546,10 @@ def has_outer_blank_line(block: bytes) -> bool:
     return block[:1] in b"\r\n" or block.endswith((b"\n\n", b"\r\n\r\n", b"\n\r\n"))
 
 
-def _top(block: bytes, header_line: int) -> int:
-    """Return the number of bytes up to the end of the header, or of the first line."""
+def _top(block: bytes, top: int) -> int:
+    """Return the number of bytes up to the end of line `top`, or of the first line."""
     end = 0
-    for _ in range(max(header_line, 1)):
+    for _ in range(max(top, 1)):
         end = block.find(b"\n", end) + 1 or len(block)
     return end
 

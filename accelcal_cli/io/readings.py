@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, are_no_counts, choose, restrict
-from accelcal_cli.io.reader import LIMIT, RowBlock, open_table
+from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, RowBlock, open_table
 from accelcal_cli.io.rows import OneSensor, ZeroRows
 from accelcal_cli.io.screening import LOOKED_AT, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
@@ -32,6 +32,24 @@ MOST_LABELS = 1_000_000
 """Different labels of poses at most: their means are kept in memory."""
 
 Label = TypeVar("Label", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class InputForm:
+    """How an input is written.
+
+    Attributes:
+        source_format: ``text, comma``, ``parquet``, ``array``, ...
+        rows: read, without those skipped; rows_skipped: broken ones left out.
+        rate_hz: rows per second of a log, None where it is unknown.
+        unit: of the readings as the file states it: g, mg, m/s^2 or counts; None where it does not.
+    """
+
+    source_format: str = "array"
+    rows: int = 0
+    rows_skipped: int = 0
+    rate_hz: float | None = None
+    unit: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +68,7 @@ class Readings:
         temperature: shape (J,), as given, NaN where missing.
         notes: what the reader did that a user should know.
         warnings: why the readings may not be what they are taken for.
+        form: how the input is written.
     """
 
     source: str
@@ -66,6 +85,7 @@ class Readings:
     temperature: Float | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[Notice, ...] = ()
+    form: InputForm = InputForm()
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 
@@ -142,14 +162,16 @@ class Readings:
         notes: Sequence[str],
         where: Callable[[int], str],
         warnings: tuple[Notice, ...] | None = None,
+        form: InputForm | None = None,
     ) -> Self:
-        """Return the same poses as those of another input, with its warnings if stated."""
+        """Return the same poses as those of another input, with its warnings and its form if stated."""
         return replace(
             self,
             sha256=sha256,
             columns=columns,
             notes=tuple(notes),
             warnings=self.warnings if warnings is None else warnings,
+            form=self.form if form is None else form,
             _line=where,
         )
 
@@ -159,28 +181,31 @@ def read_readings(
     columns: Sequence[str] | None = None,
     *,
     stdin: BinaryIO | None = None,
-    where: Sequence[str] = (),
+    options: ReadOptions = PLAIN,
 ) -> Readings:
     """Read static readings from a text table or a Parquet file; ``-`` is standard input.
 
-    `columns` names the three output columns, or numbers them from 1; without it their names decide.
-    Rows that share a position label are averaged. Of the rows only those are read that meet the conditions `where`,
-    each as COLUMN=VALUE.
+    `columns` names the three output columns, or numbers them from 1; without it their names decide. `options` say what
+    the user knows of the form of a table, and which rows to read. Rows that share a position label are averaged.
 
     Raises:
         DataError: a fault of the input, with its place, or readings of several sensors.
-        UsageError: a fault of `columns` or `where`.
+        UsageError: a fault of `columns` or of the conditions `options.where`.
     """
-    table = open_table(source, stdin)
+    table = open_table(source, stdin, options=options)
     try:
-        restrict(table, where)
-        collector = Collector(table.name, choose(table, columns))
+        restrict(table, options.where)
+        collector = Collector(table.name, choose(table, columns, count=options.count))
         one = OneSensor(table, collector.columns.identity, fleet=True)
         for rows in table.blocks(collector.columns.selection()):
             collector.columns.check(table, rows)
             one.add(rows)
             collector.add(rows)
-        return collector.readings(table.sha256, table.where)
+        collector.notes[:0] = table.notes
+        form = InputForm(
+            table.source_format, collector.rows, table.rows_skipped, None, collector.columns.unit
+        )
+        return collector.readings(table.sha256, table.where, form)
     finally:
         table.close()
 
@@ -232,6 +257,7 @@ class Collector:
         self,
         sha256: str,
         where: Callable[[int], str] | None = None,
+        form: InputForm | None = None,
         *,
         known: tuple[Float | None, Float | None] = (None, None),
         warm: bool = False,
@@ -240,7 +266,7 @@ class Collector:
         """Return the poses of all rows; DataError where they are too few or all the same.
 
         Args:
-            sha256: of the input; where: how to name a row (from 0) to the user.
+            sha256: of the input; where: how to name a row (from 0) to the user; form: how the input is written.
             known: readings behind each pose (J,) and their scatter (J, 3), where no column has them.
             warm: whether temperatures are known, likewise.
             warnings: what is said of them; None to screen them.
@@ -270,6 +296,7 @@ class Collector:
             reference=None if others is None or columns.reference is None else others[:, :3],
             temperature=None if others is None or columns.temperature is None else others[:, -1],
             notes=tuple(self.notes),
+            form=InputForm(rows=self.rows) if form is None else form,
             _store=self.store,
             _line=line,
         )

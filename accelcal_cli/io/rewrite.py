@@ -13,7 +13,7 @@ from functools import partial
 from typing import IO, TYPE_CHECKING
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.io.dialect import BOM, Dialect, is_blank, split_cells
+from accelcal_cli.io.dialect import BOM, Dialect, is_blank, is_comment, split_cells
 from accelcal_cli.io.reader import Selection, TextTable, has_outer_blank_line
 from accelcal_cli.io.stream import BackgroundThread
 
@@ -60,6 +60,7 @@ def rewrite(table: TextTable, change: Change, file: IO[bytes]) -> None:
     lines, writing = _LineWriter(table.dialect, change), BackgroundThread()
     try:
         for block, rows in table.pairs(change.selection):
+            lines.passed.update(table.passed.lines())
             writing.start(partial(lines.write, block, change.compute(rows.numbers), file))
     finally:
         writing.wait()
@@ -71,6 +72,7 @@ class _LineWriter:
     def __init__(self, dialect: Dialect, change: Change) -> None:
         self.dialect, self.change = dialect, change
         self.line = 0
+        self.passed: set[int] = set()  # lines that are no rows
         self.glue = dialect.separator.encode()
         self.titled = dialect.names is None or dialect.header_line > 0
         self.quoted = dialect.decimal_comma and dialect.separator == ","
@@ -85,7 +87,7 @@ class _LineWriter:
 
     def _plain(self, block: bytes, rows: int, end: bytes) -> bool:
         """Return whether to try polars: past the header, one kind of line ends, no blank line that it would drop."""
-        past_header = self.titled and self.line >= self.dialect.header_line
+        past_header = self.titled and self.line >= self.dialect.top
         one_end = end == b"\n" or block.count(end) == block.count(b"\r") == block.count(b"\n")
         whole = one_end and block.endswith(end) and not has_outer_blank_line(block)
         regular = not self.change.places or self._regular(block, rows)
@@ -143,9 +145,9 @@ class _LineWriter:
             text = line.removeprefix(BOM).decode(errors="replace").lstrip()
             if self.line == self.dialect.header_line:
                 line = self._changed(line, [name.encode() for name in self.change.names])
-            elif text.startswith("#"):
+            elif is_comment(text, self.dialect.marks):
                 line = self._comment(line)
-            elif not is_blank(text):
+            elif not (is_blank(text) or self.line <= self.dialect.top or self.line in self.passed):
                 self.titled = True
                 line = self._changed(line, cells[row])
                 row += 1
@@ -159,7 +161,7 @@ class _LineWriter:
 
     def _comment(self, line: bytes) -> bytes:
         """Return a comment line; one that names the columns names the new ones, too."""
-        body = line.split(b"#", 1)[1]
+        body = line.lstrip().lstrip(b"#/%;")
         names = split_cells(body.decode(errors="replace"), self.dialect.separator)
         if self.titled or names != list(self.dialect.names or ()):
             return line

@@ -20,8 +20,9 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import is_kind
-from accelcal_cli.io.dialect import Dialect, is_blank, split_cells
-from accelcal_cli.io.reader import InputTable, LineMap, RowBlock
+from accelcal_cli.io.dialect import BOM, MARKS, Dialect, is_blank, is_comment, split_cells
+from accelcal_cli.io.reader import InputTable, RowBlock
+from accelcal_cli.io.skipped import LineMap
 from accelcal_cli.notices import Notice
 
 if TYPE_CHECKING:
@@ -123,6 +124,10 @@ class RowFilter:
         self._note(np.flatnonzero(mask), len(mask))
         return frame.filter(met)
 
+    def meets(self, cells: Sequence[str]) -> bool:
+        """Return whether a whole row meets the conditions."""
+        return all(condition.holds(cells[condition.column]) for condition in self.conditions)
+
     def check(self) -> None:
         """Raise DataError where no row has met the conditions; to be called at the end of the table."""
         if self._met:
@@ -142,15 +147,15 @@ class RowFilter:
 
     def _meets(self, raw: bytes, dialect: Dialect) -> bool:
         """Return whether a line meets the conditions; one that is too short does, for the parser to find fault with."""
-        line = raw.decode(errors="replace")
-        if is_blank(line) or line.lstrip().startswith("#"):
+        line = raw.removeprefix(BOM).decode(errors="replace")
+        if is_blank(line) or is_comment(line, dialect.marks):
             return False
         cells = split_cells(line.rstrip("\r\n"), dialect.separator)
         if len(cells) <= max(condition.column for condition in self.conditions):
             return True
         if len(self._seen) <= VALUES:
             self._seen[cells[self.conditions[0].column]] = None
-        return all(condition.holds(cells[condition.column]) for condition in self.conditions)
+        return self.meets(cells)
 
     def _fast(self, block: bytes, dialect: Dialect) -> Bool | None:
         """Return which lines meet the conditions, None where polars may see other lines than are there."""
@@ -158,7 +163,8 @@ class RowFilter:
 
         odd = (
             b'"' in block
-            or b"#" in block
+            or any(mark.encode() in block for mark in MARKS)
+            or (dialect.separator != ";" and b";" in block)
             or dialect.separator == " "
             or b"\n\n" in block
             or b"\n\r\n" in block

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from itertools import chain, islice
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.io.lines import find_filter
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -26,6 +28,13 @@ PATIENCE = 100
 SHOWN = 60
 """Characters of a line that a message shows."""
 
+FIRST = 12
+"""Lines that show whether they are of several kinds."""
+
+_CLOCK = re.compile(r"(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?:\s*->)?(?![\w:])")
+"""The time that a terminal program writes before each line."""
+
+_LEAD = re.compile(r"[^\d\s]*[A-Za-z][^\d]*?(?=[-+.]?\d)")
 _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"']+")
 
 
@@ -79,26 +88,64 @@ def _open(name: str, baud: int, timeout: float) -> Serial:
         raise DataError(f"{name}: cannot be opened: {reason.lower()}") from None
 
 
-def readings(lines: Iterable[bytes], columns: Sequence[int], source: str) -> Iterator[Float]:
+def readings(
+    lines: Iterable[bytes],
+    columns: Sequence[int],
+    source: str,
+    prefix: str | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Iterator[Float]:
     """Yield three numbers of each line, shape (3,); lines without them, such as headers, are skipped.
 
+    Where the first lines are of several kinds, those of acceleration are read, as from files.
+
+    Args:
+        lines: as they arrive; columns: which numbers, from 0; source: named in messages.
+        prefix: what the lines of readings begin with, None to find them by their words.
+        tell: is told which kind of lines is taken.
+
     Raises:
-        DataError: line after line without the numbers.
+        DataError: line after line without the numbers, or lines of several kinds of which none is known.
     """
+    texts = (line.decode("utf-8", errors="replace").strip() for line in lines)
+    texts = (text for text in texts if text)
+    first = list(islice(texts, FIRST))
+    kinds = find_filter(first, source, prefix) if prefix is not None or _are_mixed(first) else None
+    if kinds is not None and (note := kinds.note()):
+        tell(f"{source}: {note}")
     unread = 0
-    for line in lines:
-        text = line.decode("utf-8", errors="replace").strip()
-        if not text or text.startswith("#"):
+    for text in chain(first, texts):
+        if kinds is not None:
+            values = kinds.values(text)
+            if values is None:
+                unread += 1
+                _check_unread(unread, source, columns, text)
+                continue
+            text = " ".join(value for value in values if ":" not in value)
+        elif text.startswith("#"):
             continue
+        else:
+            text = _CLOCK.sub("", text)
         reading = pick(text, columns)
         unread = 0 if reading is not None else unread + 1
         if reading is not None:
             yield reading
-        elif unread == PATIENCE:
-            raise DataError(
-                f"{source}: {PATIENCE} lines in a row without {max(columns) + 1} numbers, as "
-                f'"{text[:SHOWN]}"; are --columns and --baud right?'
-            )
+        _check_unread(unread, source, columns, text)
+
+
+def _are_mixed(lines: Sequence[str]) -> bool:
+    """Return whether words at their beginning tell lines of several kinds apart, or all seem to be comments."""
+    found = [line for line in lines if _LEAD.match(line)]
+    leads = {_LEAD.match(line)[0] for line in found}  # type: ignore[index]
+    return len(leads) > 1 or (bool(found) and all(line.startswith("#") for line in lines))
+
+
+def _check_unread(unread: int, source: str, columns: Sequence[int], text: str) -> None:
+    if unread == PATIENCE:
+        raise DataError(
+            f"{source}: {PATIENCE} lines in a row without {max(columns) + 1} numbers, as "
+            f'"{text[:SHOWN]}"; are --columns, --line and --baud right?'
+        )
 
 
 def pick(line: str, columns: Sequence[int]) -> Float | None:

@@ -22,6 +22,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, did_you_mean
+from accelcal_cli.io.unpack import ByteReader, unpack
 
 HEAD = 4 << 20
 """Bytes of the first block: an input up to this size is one block and never needs polars."""
@@ -35,18 +36,9 @@ LONGEST_LINE = 1 << 20
 IN_MEMORY = 1_000_000
 """Rows of a store that stay in memory."""
 
-_FOREIGN = {  # first bytes of files that users pass instead of text
-    b"\x1f\x8b": "gzip-compressed; unpack it first",
-    b"PK\x03\x04": "a zip archive or an Excel workbook; export the sheet as CSV",
-    b"\xd0\xcf\x11\xe0": "an Excel workbook; export the sheet as CSV",
-    b"\x89HDF": "an HDF5 file; export the readings as CSV or Parquet",
-    b"\xff\xfe": "UTF-16 text; save it as UTF-8",
-    b"\xfe\xff": "UTF-16 text; save it as UTF-8",
-}
-
 
 class ByteSource:
-    """One pass over a file or standard input; `sha256` covers the bytes read so far.
+    """One pass over a file or standard input; `sha256` covers the bytes read so far, `forms` how they were packed.
 
     Hashing runs in the background of the parser: at 10 million rows it would otherwise take as long as the parsing.
     """
@@ -66,7 +58,8 @@ class ByteSource:
         An `owned` stream is closed with the source; one that is not `hashed` has no `sha256`.
         """
         self.name = name
-        self._stream = stream
+        self._stream: ByteReader = stream
+        self._opened = stream
         self._block = block
         self._owned = owned
         self.hashed = hashed
@@ -76,13 +69,17 @@ class ByteSource:
         self._may_read_ahead = stream.seekable()  # a pipe may block, and with it the end of the program
         self._ahead: bytes | None = None
         raw = self._read(head)
+        unpacked = unpack(stream, raw, name, self._hash.update)
+        self.forms: tuple[str, ...] = ()
+        self._digest_here = unpacked is None
+        if unpacked is not None:  # its decoders tell the hash what they read
+            self._stream, self.forms = unpacked.stream, unpacked.forms
+            raw = self._read(head)
+        else:
+            self._hash.update(raw)
         self.whole = len(raw) < head  # the head is all there is
-        self._hash.update(raw)
         self._carriage_returns = b"\n" not in raw and b"\r" in raw[:-1]  # line ends of old Macs
         self.head = self._unify(raw)
-        for magic, what in _FOREIGN.items():
-            if raw.startswith(magic):
-                raise DataError(f"{name}: is {what}")
 
     def stop(self) -> None:
         """Let `rest` end early, for a reader in another thread."""
@@ -91,12 +88,14 @@ class ByteSource:
     def close(self) -> None:
         """Close the stream if it is ours."""
         self._reading.wait()
-        if self._owned:
+        if self.forms:
             self._stream.close()
+        if self._owned:
+            self._opened.close()
 
     @property
     def sha256(self) -> str:
-        """Hexadecimal SHA-256 of the bytes read so far."""
+        """Hexadecimal SHA-256 of the bytes read so far, as they are in the file."""
         self._hashing.wait()
         return self._hash.hexdigest()
 
@@ -130,7 +129,7 @@ class ByteSource:
         raw = self._read(self._block) if self._ahead is None else self._ahead
         if raw and self._may_read_ahead:
             self._reading.start(self._read_ahead)
-        if raw and self.hashed:
+        if raw and self.hashed and self._digest_here:
             self._hashing.start(lambda: self._hash.update(raw))
         return self._unify(raw)
 

@@ -172,7 +172,7 @@ def grade_of(calibration: Calibration, grade: InsGrade, where: str) -> InsGrade:
     """
     K = calibration.model.in_gauge("lower").K if calibration.gauge == "full" else calibration.K_a
     sigma = np.asarray(calibration.sigma.D_a) / np.abs(np.diag(K))
-    if calibration.unit == "g":
+    if calibration.unit != "m/s^2":
         sigma = sigma * STANDARD_GRAVITY
     value = float(np.sqrt(np.mean(np.square(sigma)))) / METRES_PER_MICRO_G
     if not math.isfinite(value) or value <= 0:

@@ -16,9 +16,11 @@ from string import ascii_letters
 from typing import IO, Any
 
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.text import Text
 
+from accelcal_cli.errors import visible
 from accelcal_cli.views.blocks import Block, Conclusion, Convergence, Paragraph, Table
 
 PIPE_WIDTH = 160
@@ -39,7 +41,16 @@ VERDICT_STYLE = {
 
 
 class _Console(Console):
-    """A console that leaves a broken pipe to the command line; rich itself would exit with 1."""
+    """A console that leaves a broken pipe to the command line, where rich itself would exit with 1.
+
+    Control characters in what is shown are written out: labels come from files.
+    """
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the segments of what is drawn, without control characters but those of rich itself."""
+        for segment in super().render(renderable, options):
+            plain = segment.text if segment.control else visible(segment.text)
+            yield segment if plain == segment.text else Segment(plain, segment.style)
 
     def on_broken_pipe(self) -> None:
         """Pass the BrokenPipeError on."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from accelcal_cli.errors import visible
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.views.blocks import Table
@@ -22,19 +24,27 @@ if TYPE_CHECKING:
     from accelcal_cli.sensor.simulation import LogSegment
 
 
+_STEERING = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Control characters that JSON may hold as they are, and that a terminal would obey."""
+
+
 def write_csv(table: Table, file: IO[str]) -> None:
     """Write a table as CSV: keys of the columns, then rows; numbers with all their digits, nothing for none."""
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow([column.label for column in table.columns])
     inf = math.inf
-    for row in table.rows:
+    rows = table.rows
+    if file.isatty():
+        rows = tuple(tuple(visible(v) if isinstance(v, str) else v for v in row) for row in rows)
+    for row in rows:
         # As `_finite` has it; a call for each cell would take longer than writing it.
         writer.writerow(["" if isinstance(v, float) and not -inf < v < inf else v for v in row])
 
 
 def json_text(record: Any) -> str:
     """Return a record as JSON text with a line end; it must hold no NaN."""
-    return json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False)
+    return _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", text) + "\n"
 
 
 def json_rows(tables: Iterable[Table]) -> list[Any]:

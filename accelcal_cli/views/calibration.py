@@ -94,7 +94,9 @@ def _pair(value: float, interval: float, *, lost: bool) -> list[object]:
 def engineering(result: Calibration) -> Table:
     """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
     # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
-    metres, per_g = (units.STANDARD_GRAVITY, 1.0) if result.unit == "g" else (1.0, result.g)
+    force = result.unit in ("g", "mg")  # in units of g, not in metres
+    metres = units.STANDARD_GRAVITY / units.OUTPUT_OF_1_G[result.unit]
+    per_g = units.OUTPUT_OF_1_G[result.unit] if force else result.g
     values, sigma = result.engineering
     values[BIAS] /= per_g
     interval = result.interval_of(sigma)

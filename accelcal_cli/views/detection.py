@@ -31,7 +31,7 @@ def blocks(detection: Detection) -> list[Block]:
 
 
 def poses_table(detection: Detection) -> Table:
-    """Return one row per pose: rows, count, mean, standard deviation, times. `accelcal calibrate` reads it as CSV."""
+    """Return one row per pose: rows, count, mean, standard deviation, times, temperature, as `calibrate` reads it."""
     poses = detection.intervals
     columns = [
         *(Column(name, format=",") for name in ("start", "end", "n")),
@@ -43,6 +43,9 @@ def poses_table(detection: Detection) -> Table:
     if poses.time is not None:
         columns += [Column("t_start", format=".10g"), Column("t_end", format=".10g")]
         values.append(poses.time)
+    if poses.temperature is not None:
+        columns.append(Column("T", format=".6g"))
+        values.append(poses.temperature[:, None])
     numbers = np.hstack(values).tolist()
     whole = tuple((*row, *cells) for row, cells in zip(rows, numbers, strict=True))
     return Table(f"Static poses of {detection.source}", tuple(columns), whole)
@@ -85,7 +88,12 @@ def record(detection: Detection) -> dict[str, Any]:
     return to_mapping(
         {
             "schema": SCHEMA,
-            "data": {"source": detection.source, "sha256": detection.sha256, "columns": detection.columns},
+            "data": {
+                "source": detection.source,
+                "sha256": detection.sha256,
+                "columns": detection.columns,
+                **asdict(detection.form),
+            },
             "rows": detection.log_rows,
             "rate": detection.rate,
             "window": rows.window,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -213,7 +212,7 @@ def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio
 
 @pytest.mark.parametrize("part", [0.01, 0.03])
 def test_the_noise_bias_is_taken_off(part):
-    """Noise of one sample a pose, in 40 000 poses: without the correction the scale factors are 3.5 part^2 too large."""
+    """Noise of one sample a pose, in 40 000 poses: without the correction scale factors are 3.5 part^2 too large."""
     u = noise(40_000, 1.0, 3)
     u /= np.linalg.norm(u, axis=1)[:, None]
     result = calibrate(readings(u, sigma=part * G), FAST)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from raw_logs import opened, simulated, text
 
-from accelcal_cli.detection.rawlog import Clock, unit_of
 from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.io.clock import Clock, unit_of
 
 LOG, _ = simulated(2, hold=4.0)
 A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]

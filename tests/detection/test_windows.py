@@ -10,7 +10,6 @@ from raw_logs import in_blocks, opened, simulated, text
 
 from accelcal_cli.detection.detect import DetectSettings, TooFewPosesError, detect
 from accelcal_cli.detection.intervals import find_intervals, find_level
-from accelcal_cli.detection.rawlog import Clock
 from accelcal_cli.detection.windows import (
     MOST_BINS,
     Envelope,
@@ -24,6 +23,7 @@ from accelcal_cli.detection.windows import (
     windows,
 )
 from accelcal_cli.errors import UsageError
+from accelcal_cli.io.clock import Clock
 
 ROWS = RowLengths(tile=10, width=10, still=None, least=100, trim=50)
 LOG, HOLDS = simulated(gyro=False)

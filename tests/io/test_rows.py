@@ -7,7 +7,7 @@ import pytest
 
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import restrict
-from accelcal_cli.io.reader import Selection, open_table
+from accelcal_cli.io.reader import ReadOptions, Selection, open_table
 from accelcal_cli.io.readings import read_readings
 
 TABLE = """# two sensors
@@ -112,7 +112,7 @@ def test_several_sensors_are_refused_with_a_way_out(tmp_path, header):
         DataError, match=rf'column "{header}" has 2 values \(A 1, B\).*--where .{header}=A 1.'
     ):
         read_readings(path)
-    assert read_readings(path, where=[f"{header}=A 1"]).poses == 12
+    assert read_readings(path, options=ReadOptions(where=(f"{header}=A 1",))).poses == 12
 
 
 def test_kinds_of_poses_are_no_sensors_and_kinds_of_sensors_are(tmp_path):

@@ -85,7 +85,7 @@ CALIBRATE = {
     "one column twice": (["good.csv", "--columns", "1,2,1"], ["--columns", "twice"]),
     "all equal": (["equal.csv"], ["equal.csv", "20 readings are equal", "(1, 2, 3)"]),
     "one pose": (["one.csv"], ["one.csv", "only one pose", "twelve poses"]),
-    "not UTF-8": (["latin.csv"], ["latin.csv, line 3", "UTF-8"]),
+    "not UTF-8": (["latin.csv"], ["latin.csv, line 3", '"é" is not a number']),
     "binary": (["zeros.csv"], ["zeros.csv, line 1", "binary"]),
     "compressed": (["packed.csv"], ["packed.csv", "gzip"]),
     "not Parquet": (["not.parquet"], ["not.parquet", "Parquet"]),

@@ -1,0 +1,216 @@
+"""Lines of words and numbers, as sketches print them: ``AcX = 12 | AcY = -5``, ``Raw: 1, 2, 3``, ``#A-R=1,2,3``.
+
+Lines are of one kind when nothing but their numbers differs. `choose_kind` finds the kind that holds acceleration among
+those of a sample, and `LineKind.row` its numbers in a line; files and live streams use the same.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from accelcal_cli.errors import DataError
+from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
+
+RARE = 0.02
+"""Part of the lines of a sample below which a kind is an accident."""
+
+SHOWN = 5
+"""Kinds that a message names at most."""
+
+COLUMNS_OF_NINE = ("ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz")
+"""What nine numbers behind one word are, as in the ``Raw:`` lines that MotionCal reads."""
+
+_VALUE = re.compile(
+    r"(?P<clock>(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?![\w:]))"
+    r"|(?P<number>(?<![\w.^/])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"
+)
+_BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"'>-]+")
+
+
+@dataclass(frozen=True)
+class LineKind:
+    """A kind of line.
+
+    Attributes:
+        lead: the words before its first number, by which it is called; words: lower case, between the numbers.
+        labels: a name for each number, "" where it has none; units: the unit behind it, "" where there is none.
+        share: its part of the sample.
+    """
+
+    lead: str
+    words: tuple[str, ...]
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    share: float = 0.0
+
+    @property
+    def acceleration(self) -> bool:
+        """Whether some of its numbers are acceleration by their words."""
+        means = [describe(label) for label in self.labels if label]
+        known = [unit for unit in self.units if parse_unit(unit) in FORCE_UNITS]
+        razor = self.lead.strip(" #=:").upper() in ("A-R", "A-C", "A-RC")
+        return razor or len(known) >= 3 or sum(m.quantity == "acceleration" for m in means) >= 1
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Names of the numbers; None where words do not tell them apart."""
+        if len(self.labels) == 9 and not any(self.labels[1:]):
+            return COLUMNS_OF_NINE
+        if len(self.labels) == 3 and self.acceleration and not any(self.labels[1:]):
+            return tuple(f"a{axis}" for axis in AXES)
+        return self.labels if all(self.labels) and len(set(self.labels)) == len(self.labels) else None
+
+    def row(self, line: str) -> list[str] | None:
+        """Return the numbers of a line of this kind as text, None for a line of another kind."""
+        words, values = _parts(line)
+        return values if len(values) == len(self.labels) and tuple(words) == self.words else None
+
+    def begins(self, line: str) -> bool:
+        """Return whether a line begins as this kind does, so that it is a broken one where `row` finds nothing."""
+        return bool(self.lead) and line.lstrip().lower().startswith(self.lead.lower())
+
+
+@dataclass(frozen=True)
+class LineFilter:
+    """The lines of one kind as rows of comma-separated numbers.
+
+    Attributes:
+        prefix: what a line must begin with, taken off; kind: of the lines.
+        kinds: all kinds of the sample, the commonest first.
+    """
+
+    kind: LineKind
+    kinds: tuple[LineKind, ...]
+    prefix: str = ""
+
+    def translate(self, block: bytes) -> bytes:
+        """Return a block of lines as rows: one line each, empty where it is of another kind."""
+        lines = block.decode("utf-8", errors="replace").split("\n")
+        return "\n".join(map(self._row, lines)).encode()
+
+    def values(self, line: str) -> list[str] | None:
+        """Return the numbers of a line as text, None where it is not of this kind."""
+        rest = without_prefix(line, self.prefix)
+        return None if rest is None else self.kind.row(rest)
+
+    def note(self) -> str:
+        """Say what was taken of lines of several kinds, "" where there is one."""
+        others = [called(kind) for kind in self.kinds if kind is not self.kind]
+        if not others:
+            return ""
+        return (
+            f"lines are of several kinds: {called(self.kind)} taken, {', '.join(others[:SHOWN])} left out; "
+            "--line PREFIX takes others"
+        )
+
+    def _row(self, line: str) -> str:
+        rest = without_prefix(line.rstrip("\r"), self.prefix)
+        if rest is None:
+            return ""
+        values = self.kind.row(rest)
+        if values is not None:
+            return ",".join(value.replace(",", ".") if ":" in value else value for value in values)
+        return rest if self.kind.begins(rest) else ""
+
+
+def called(kind: LineKind) -> str:
+    """Return how a message names a kind."""
+    lead = kind.lead.strip()
+    return f'"{lead}"' if lead else f"{len(kind.labels)} bare numbers"
+
+
+def without_prefix(line: str, prefix: str) -> str | None:
+    """Return a line without its prefix, None for one that does not begin with it."""
+    text = line.lstrip()
+    return text[len(prefix) :] if text.startswith(prefix) else None
+
+
+def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) -> LineFilter | None:
+    """Return the filter of some lines, None where their numbers stand in no words.
+
+    Args:
+        lines: of a sample; source: named in messages.
+        prefix: of the lines to take, None for the kind that holds acceleration.
+
+    Raises:
+        DataError: no line has the prefix, or several kinds may be acceleration.
+    """
+    kept = lines
+    if prefix is not None:
+        rests = [without_prefix(line, prefix) for line in lines]
+        kept = [rest for rest in rests if rest is not None]
+        if not kept:
+            found = ", ".join(called(kind) for kind in _kinds(lines)[:SHOWN]) or "no lines with numbers"
+            raise DataError(f'{source}: no line begins with "{prefix}" (--line); there are {found}')
+    kinds = _kinds(kept)
+    able = [kind for kind in kinds if len(kind.labels) >= 3]
+    if prefix is None and not any(kind.lead.strip() or any(kind.labels) for kind in able):
+        return None
+    chosen = [kind for kind in able if kind.acceleration] or able
+    if not chosen:
+        return None
+    if len(chosen) > 1 and prefix is None:
+        shown = " or ".join(called(kind) for kind in chosen[:SHOWN])
+        raise DataError(
+            f"{source}: lines are of several kinds, and the readings could be {shown}; say which with --line, as in "
+            f'--line "{chosen[0].lead.strip() or "PREFIX"}"'
+        )
+    return LineFilter(chosen[0], tuple(kinds), prefix or "")
+
+
+def _kinds(lines: Sequence[str]) -> list[LineKind]:
+    """Return the kinds of lines with numbers, the commonest first."""
+    counts: dict[tuple[tuple[str, ...], int], tuple[int, str]] = {}
+    for line in lines:
+        words, values = _parts(line)
+        key = tuple(words), len(values)
+        if values:
+            counts[key] = counts.get(key, (0, line))[0] + 1, counts.get(key, (0, line))[1]
+    least = max(1, RARE * len(lines))
+    return [
+        _kind(line, count / len(lines))
+        for count, line in sorted(counts.values(), key=lambda item: -item[0])
+        if count >= least
+    ]
+
+
+def _parts(line: str) -> tuple[list[str], list[str]]:
+    """Return the words around the numbers of a line, one more than numbers, and the numbers as text."""
+    words, values, at = [], [], 0
+    for match in _VALUE.finditer(line):
+        words.append(_normal(line[at : match.start()]))
+        values.append(match[0])
+        at = match.end()
+    return [*words, _normal(line[at:])], values
+
+
+def _normal(text: str) -> str:
+    return " ".join(text.lower().split())
+
+
+def _kind(line: str, share: float) -> LineKind:
+    matches = list(_VALUE.finditer(line))
+    labels: list[str] = []
+    units: list[str] = []
+    family = ""
+    for k, match in enumerate(matches):
+        before = line[matches[k - 1].end() if k else 0 : match.start()]
+        behind = line[match.end() : matches[k + 1].start() if k + 1 < len(matches) else len(line)]
+        words = [word for word in _BETWEEN.split(before) if word]
+        if k and words and (parse_unit(words[0]) in FORCE_UNITS) and units[-1:] == [words[0]]:
+            words = words[1:]
+        label = " ".join(words[-3:])
+        meaning = describe(label) if label else None
+        if meaning is not None and meaning.axis is not None and meaning.family:
+            family = label.rsplit(" ", 1)[0] if " " in label else ""
+        elif meaning is not None and meaning.axis is not None and family:
+            label = f"{family} {label}"
+        labels.append("time" if match["clock"] and not label else label)
+        tail = [word for word in re.split(r"[\s,;|]+", behind.strip()) if word]
+        units.append(tail[0] if tail and parse_unit(tail[0]) else "")
+    if units and parse_unit(units[-1]) in FORCE_UNITS:  # one unit behind the last number is that of all
+        units = [unit or units[-1] for unit in units]
+    lead = line[: matches[0].start()].strip()
+    return LineKind(lead, tuple(_parts(line)[0]), tuple(labels), tuple(units), share)
