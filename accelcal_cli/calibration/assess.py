@@ -261,7 +261,8 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
-    always |= settings.nominal is not None or _trembling(fit)
+    always |= settings.nominal is not None
+    always |= fit.solution is not None and fit.solution.stated.tremor is not None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
 
@@ -294,10 +295,6 @@ def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:
         remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
         notices.append(Notice("residuals", "warning", text, remedy))
     return tuple(notices)
-
-
-def _trembling(fit: Fit) -> bool:
-    return fit.solution is not None and fit.solution.stated.tremor is not None
 
 
 def _fewest_attitudes(fit: Fit) -> int:

@@ -97,9 +97,8 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
 
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
-    fit = assessment.fit
-    settings, search, model = fit.settings, fit.search, ErrorModel(fit.K[at], fit.D[at])
-    ratio, chance = (_number(part[at]) for part in (fit.spread.ratio, fit.spread.p_more))
+    fit, settings, search = assessment.fit, assessment.fit.settings, assessment.fit.search
+    model = ErrorModel(fit.K[at], fit.D[at])
     return Calibration(
         K_a=model.K,
         D_a=model.D,
@@ -121,8 +120,8 @@ def record(assessment: Assessment, at: int) -> Calibration:
         before=fit.before[at],
         s=float(fit.s[at]),
         freedom=int(fit.freedom[at]),
-        residual_noise_ratio=ratio,
-        residual_noise_p=chance,
+        residual_noise_ratio=_number(fit.spread.ratio[at]),
+        residual_noise_p=_number(fit.spread.p_more[at]),
         covariance=fit.covariance[at],
         information=fit.information[at],
         nominal_scale=np.array(fit.nominal[at]),

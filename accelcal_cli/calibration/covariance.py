@@ -37,7 +37,7 @@ MOST_CLUSTERS, FEWEST_CLUSTERS = 2048, 16
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class NoiseSpread:
     """The noise of a fit and what it does to the parameters, for R sensors.
 
     Attributes:
@@ -59,16 +59,16 @@ class Spread:
     shared: Float
 
 
-def plain_spread(variance: Float, cofactor: Float, freedom: Int) -> Spread:
+def plain_spread(variance: Float, cofactor: Float, freedom: Int) -> NoiseSpread:
     """Return the spread of poses with the same noise: s^2, shape (R,), and (A^T W A)^-1, shape (R, q, q)."""
     nothing = np.full(len(variance), np.nan)
     covariance = variance[:, None, None] * cofactor
-    return Spread(variance, covariance, np.maximum(freedom, 0).astype(float), *(nothing,) * 4)
+    return NoiseSpread(variance, covariance, np.maximum(freedom, 0).astype(float), *(nothing,) * 4)
 
 
 def scattered_spread(
-    plain: Spread, rows: Float, w: Float, cofactor: Float, noise: PoseNoise, freedom: Int
-) -> Spread:
+    plain: NoiseSpread, rows: Float, w: Float, cofactor: Float, noise: PoseNoise, freedom: Int
+) -> NoiseSpread:
     """Return the spread of poses whose noise differs as their scatter says.
 
     Args:
@@ -94,7 +94,7 @@ def scattered_spread(
     own = np.where(freedom > 0, _satterthwaite(V, w, rows, cofactor, leverage), denominator)
     usable = told | (noise.known & (freedom == 0))
     mean = np.sum(v, axis=1) / np.maximum(np.count_nonzero(w, axis=1), 1)
-    return Spread(
+    return NoiseSpread(
         np.where(usable & (freedom == 0), mean, plain.variance),
         np.where(usable[:, None, None], sandwich(rows, w, V, cofactor), plain.covariance),
         np.where(usable, own, plain.freedom),

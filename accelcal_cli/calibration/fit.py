@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.attitudes import CellCount, Geometry, distinct
 from accelcal_cli.calibration.covariance import (
     Clusters,
-    Spread,
+    NoiseSpread,
     autocorrelated,
     isotropic_bias,
     jumps,
@@ -68,10 +69,7 @@ class Fit:
         geometry: what the distinct attitudes determine: the verdict on the poses.
         freedom: degrees of freedom of the residuals, shape (R,).
         spread: noise and covariance, before it is asked whether the covariance holds.
-        s: standard deviation of one pose's modulus (with known attitudes of one axis), m/s^2, NaN without freedom,
-            shape (R,).
         covariance: of the nine parameters, (m/s^2)^2, shape (R, 9, 9), NaN where it does not hold.
-        coverage: factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`.
         bias: what may remain of the noise bias, m/s^2, shape (R, 9); see `_unbiased`.
         clusters: rows that follow each other are summed over so many clusters, shape (R,); 0 where they do not.
         at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
@@ -97,10 +95,8 @@ class Fit:
     sight: tuple[Float, Float]
     geometry: Geometry
     freedom: Int
-    spread: Spread
-    s: Float
+    spread: NoiseSpread
     covariance: Float
-    coverage: Float
     bias: Float
     clusters: Int
     at_wall: Bool
@@ -111,6 +107,16 @@ class Fit:
     residuals: PoseResiduals
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def s(self) -> Float:
+        """Standard deviation of one pose's modulus, m/s^2, NaN without freedom, shape (R,); see `NoiseSpread`."""
+        return np.sqrt(self.spread.variance)
+
+    @cached_property
+    def coverage(self) -> Float:
+        """Factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`."""
+        return coverage_of(self.spread.freedom)
 
     @property
     def temperature(self) -> Temperature | None:
@@ -159,15 +165,11 @@ def fit(solution: Solution) -> Fit:
     centre = solution.stated.cost.box.centre
     nominal, bias, before = uncalibrated(centre[:, :3].mean(axis=1), centre[:, -3:], settings)
     sums, kept = _pass(solution, (point.lower, point.D), (nominal, bias))
-    rejected = solution.stated.rejected
-    residuals = pose_residuals(
-        sums[2], kept, sample, _absorbed(solution, observability), freedom, held, rejected, g
-    )
+    absorbed, rejected = _absorbed(solution, observability), solution.stated.rejected
+    residuals = pose_residuals(sums[2], kept, sample, absorbed, freedom, held, rejected, g)
     spread, clusters = _spread(solution, point, sums)
     at_wall, shown = _at_wall(solution.x), to_gauge(point.K, settings.gauge)
-    view, information, sight = _first_sight(
-        solution, observability, point.information, (point.lower, point.D)
-    )
+    view, information, sight = _first_sight(solution, point)
     geometry = _geometry(solution, information, sight, held)
     verdicts, walled = geometry.observability.verdicts, np.asarray(at_wall.any(axis=1))
     covariance = _covariance(observability, verdicts, spread, walled, g)
@@ -189,9 +191,7 @@ def fit(solution: Solution) -> Fit:
         geometry=geometry,
         freedom=freedom,
         spread=spread,
-        s=np.sqrt(spread.variance),
         covariance=covariance,
-        coverage=coverage_of(spread.freedom),
         bias=point.bias,
         clusters=clusters,
         at_wall=at_wall,
@@ -260,7 +260,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     )
 
 
-def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[Spread, Int]:
+def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread, Int]:
     """Return noise and covariance, and into how many clusters rows that follow each other are summed (0: none)."""
     sample, stated = solution.sample, solution.stated
     cofactor, freedom = point.observability.cofactor, point.freedom
@@ -285,7 +285,7 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[Spread, Int
     return spread, clusters
 
 
-def _by_own(spread: Spread, own: tuple[float, int], freedom: Float) -> Spread:
+def _by_own(spread: NoiseSpread, own: tuple[float, int], freedom: Float) -> NoiseSpread:
     """Return the spread with the noise ratio of a fit that no shared error is fitted to: sum e^2 / v over J - p."""
     square, first = own[0] / own[1], np.array([float(own[1])])
     return replace(
@@ -344,9 +344,7 @@ def _geometry(
     return Geometry.of(np.where(alike[:, None, None], information, once), attitudes, held)
 
 
-def _first_sight(
-    solution: Solution, observability: Observability, information: Float, found: tuple[Float, Float]
-) -> tuple[Observability, Float, tuple[Float, Float]]:
+def _first_sight(solution: Solution, point: _Point) -> tuple[Observability, Float, tuple[Float, Float]]:
     """Return the observability that verdicts are explained with, the information, and the sensors' K and D.
 
     Readings that fix no ellipsoid let noise choose the undetermined parameters, and the others with them: the
@@ -354,16 +352,17 @@ def _first_sight(
     """
     sphere = np.array([source == "sphere" for source in solution.stated.sources])
     if not sphere.any():
-        return observability, information, found
+        return point.observability, point.information, (point.lower, point.D)
     held = None if solution.stated.settings.misalignment else ALIGNED
     K, D = solution.cost.parameters(np.zeros_like(solution.x))
-    nine, point = solution.plain.in_lower(K, D)
-    round_information = nine.information(point)
+    nine, x = solution.plain.in_lower(K, D)
+    round_information = nine.information(x)
     view = Observability.of(round_information, solution.sample.poses, held)
     sphere &= np.array([verdict == "undetermined" for verdict in view.verdicts])
     square = sphere[:, None, None]
-    sight = np.where(square, K, found[0]), np.where(sphere[:, None], D, found[1])
-    return observability.replaced(sphere, view), np.where(square, round_information, information), sight
+    sight = np.where(square, K, point.lower), np.where(sphere[:, None], D, point.D)
+    information = np.where(square, round_information, point.information)
+    return point.observability.replaced(sphere, view), information, sight
 
 
 def _absorbed(solution: Solution, observability: Observability) -> Float:
@@ -477,7 +476,7 @@ def _pass(
 
 
 def _covariance(
-    observability: Observability, verdicts: Sequence[PoseVerdict], spread: Spread, walled: Bool, g: float
+    observability: Observability, verdicts: Sequence[PoseVerdict], spread: NoiseSpread, walled: Bool, g: float
 ) -> Float:
     """Return the covariance of the nine parameters, (m/s^2)^2, shape (R, 9, 9); NaN where it does not hold.
 

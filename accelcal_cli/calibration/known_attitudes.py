@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.attitudes import Geometry, distinct
 from accelcal_cli.calibration.covariance import plain_spread
-from accelcal_cli.calibration.fit import Fit, coverage_of, uncalibrated
+from accelcal_cli.calibration.fit import Fit, uncalibrated
 from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability
 from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL, PoseResiduals, room_of
 from accelcal_cli.calibration.result import Calibration
@@ -48,31 +48,23 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     Raises:
         DataError: no reference, or one of another unit than g; attitudes that determine too little.
     """
-    readings, g = sample.readings(0), settings.g
-    N, f, w = _inputs(sample, settings, readings)
-    K, D, cofactor, leverage = _solved(N, f, w, g, readings)
-    left = N - f @ K.T - D
-    error = np.linalg.solve(K, left.T).T  # K_a^-1 (N - K_a f - D_a), m/s^2, shape (J, 3)
+    g, (N, f, w) = settings.g, _inputs(sample, settings, sample.readings(0))
+    K, D, cofactor, leverage = _solved(N, f, w, g, sample.readings(0))
     free = len(f) - 4
-    freedom, room = 3 * free, free if free > 0 else np.nan
-    s = np.sqrt(np.sum(w[:, None] * error**2) / (3 * room))
-    axes = np.sqrt(np.sum(w[:, None] * left**2, axis=0) / room)  # s_i, output units
+    error, s, axes = _noise(K, N - f @ K.T - D, w, free)
     low = to_gauge(K, "lower")
-    back = np.linalg.solve(K, np.diag(axes))
-    covariance, nine = _nine(K, low, cofactor, back @ back.T)[None], _nine(K, low, cofactor, np.eye(3))
+    covariance, nine = _two_of_nine(K, low, cofactor, axes)
     dop = np.sqrt(np.diagonal(cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
     size = np.sqrt(np.diagonal(K @ K.T))  # the output of each axis for one unit of force along it
     nominal, bias, before = uncalibrated(np.array([size.mean()]), D[None], settings)
     raw = np.linalg.norm((N - bias) / nominal, axis=1) - g
     force = (N - D) @ np.linalg.inv(low).T
     length = np.linalg.norm(force, axis=1)
-    modulus, value = length - np.linalg.norm(f, axis=1), np.array([np.sum((g * g - length**2) ** 2)])
+    modulus, value = length - np.linalg.norm(f, axis=1), np.sum((g * g - length**2) ** 2, keepdims=True)
     columns = Observability(cofactor[None], dop[None], dop[None], np.array([4]), NAMES)
-    u = f / np.linalg.norm(f, axis=1, keepdims=True)
-    attitudes, _ = distinct(u[None], np.ones((1, len(u)), dtype=bool), sample.labelled)
-    information = np.linalg.pinv(nine)[None]
-    view = Observability(nine[None], np.sqrt(np.diagonal(nine))[None], columns.bounded, np.array([9]))
-    spread = plain_spread(np.array([s**2]), nine[None], np.array([free]))
+    information = np.linalg.pinv(nine)
+    view = Observability(nine, np.sqrt(np.einsum("rpp->rp", nine)), columns.bounded, np.array([9]))
+    spread = plain_spread(np.array([s**2]), nine, np.array([free]))
     return Fit(
         sample=sample,
         settings=settings,
@@ -87,20 +79,18 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         view=view,
         information=information,
         sight=(low[None], D[None]),
-        geometry=Geometry(attitudes, columns, information),
-        freedom=np.array([freedom]),
+        geometry=Geometry(_attitudes(f, sample), columns, information),
+        freedom=np.array([3 * free]),
         spread=replace(spread, covariance=covariance),
-        s=np.array([s]),
         covariance=covariance,
-        coverage=coverage_of(spread.freedom),
         bias=np.zeros((1, 9)),
-        clusters=np.zeros(1, dtype=np.intp),
+        clusters=np.zeros(1, np.intp),
         at_wall=np.zeros((1, 12), dtype=bool),
         rms=np.sqrt([np.mean(modulus**2)]),
         rms_before=np.sqrt([np.mean(raw**2)]),
         before=before,
         nominal=nominal,
-        residuals=_residuals(error, w, leverage, s, freedom, modulus, raw, force),
+        residuals=_residuals(error, w, leverage, s, 3 * free, modulus, raw, force),
         notes=_notes(sample),
     )
 
@@ -158,6 +148,29 @@ def _check_axes(readings: Readings, N: Float, K: Float) -> None:
             f"{readings.source}: columns {', '.join(readings.columns)} depend on each other; three sensor axes were "
             "expected"
         )
+
+
+def _noise(K: Float, left: Float, w: Float, free: int) -> tuple[Float, float, Float]:
+    """Return what is left as force, m/s^2, shape (J, 3), its standard deviation s, and s_i in output units, shape (3,).
+
+    Args:
+        K: shape (3, 3); left: N - K_a f - D_a, output units, shape (J, 3); w: weights, shape (J,); free: J - 4.
+    """
+    error, room = np.linalg.solve(K, left.T).T, free if free > 0 else np.nan
+    s = float(np.sqrt(np.sum(w[:, None] * error**2) / (3 * room)))
+    return error, s, np.sqrt(np.sum(w[:, None] * left**2, axis=0) / room)
+
+
+def _attitudes(f: Float, sample: Sample) -> Int:
+    """Return how many distinct attitudes the specific force has, m/s^2, shape (J, 3): shape (1,)."""
+    u = f / np.linalg.norm(f, axis=1, keepdims=True)
+    return distinct(u[None], np.ones((1, len(u)), dtype=bool), sample.labelled)[0]
+
+
+def _two_of_nine(K: Float, low: Float, cofactor: Float, axes: Float) -> tuple[Float, Float]:
+    """Return covariance and cofactor of the nine parameters, shape (1, 9, 9), for axes of the noise s_i, shape (3,)."""
+    back = np.linalg.solve(K, np.diag(axes))
+    return _nine(K, low, cofactor, back @ back.T)[None], _nine(K, low, cofactor, np.eye(3))[None]
 
 
 def _nine(K: Float, low: Float, cofactor: Float, noise: Float) -> Float:

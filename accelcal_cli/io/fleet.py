@@ -337,8 +337,6 @@ class _FleetCollector:
                     idle.setdefault(int(codes[row]), []).append(rows.start + row)
                 codes, numbers, label = codes[keep], numbers[keep], list(compress(label, keep.tolist()))
             output, (count, scatter, _) = numbers[:, :3], columns.split(numbers[:, 3:])
-            if not len(output):
-                continue
             if means is None:
                 self._add(codes, output, count, scatter)
             else:

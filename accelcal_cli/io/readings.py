@@ -397,6 +397,8 @@ class LabelledMeans(Generic[Label]):
     ) -> None:
         """Add rows (B, width), with weights (B,) and standard deviations (B, 3) in sensor units if known."""
         codes, size = number_labels(self.index, labels), len(self.index)
+        if not len(rows):
+            return
         self._grow(size)
         self.weighted, self.spreads = weight is not None, spread is not None
         weight = np.ones(len(rows)) if weight is None else weight

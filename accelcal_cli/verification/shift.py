@@ -14,7 +14,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.assess import Assessment, assess
-from accelcal_cli.calibration.covariance import Spread, plain_spread, sandwich, scattered_spread
+from accelcal_cli.calibration.covariance import NoiseSpread, plain_spread, sandwich, scattered_spread
 from accelcal_cli.calibration.distributions import Noise
 from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.observability import UNDETERMINED, design
@@ -227,7 +227,7 @@ class _View:
         one, weights = np.ones((1, int(self.stated.sample.poses[0]))), self.stated.weights
         return one if weights is None else weights
 
-    def spread(self, variance: float, freedom: int) -> Spread:
+    def spread(self, variance: float, freedom: int) -> NoiseSpread:
         """Return noise and covariance of a linear step that leaves so much variance of weight 1."""
         spread = plain_spread(np.array([variance]), self.cofactor[None], np.array([freedom]))
         if self.stated.noise is None or freedom < 1:
@@ -235,7 +235,7 @@ class _View:
         rows, noise, count = design(self.u), self.stated.noise, np.array([freedom])
         return scattered_spread(spread, rows, self.weights(), self.cofactor[None], noise, count)
 
-    def shift(self, spread: Spread, value: Float, felt: Float | None, known: Bool, step: Float) -> Shift:
+    def shift(self, spread: NoiseSpread, value: Float, felt: Float | None, known: Bool, step: Float) -> Shift:
         """Return the shift with the noise that the new readings show, or else that of the result."""
         variance, expected, assumed = self._by_result()
         freedom = float(spread.freedom[0]) if self._shows_noise(spread) else 0.0
@@ -257,7 +257,7 @@ class _View:
             g=self.old.g,
         )
 
-    def _shows_noise(self, spread: Spread) -> bool:
+    def _shows_noise(self, spread: NoiseSpread) -> bool:
         """Whether residuals tell the noise; scatter alone says nothing of what the poses share."""
         return _counted(self.stated) > self.basis.shape[1] and bool(spread.freedom[0] >= 1)
 
