@@ -14,12 +14,14 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import flow  # noqa: E402
 
-FILES, LINES = 138, 600
+FILES, LINES = 146, 600
+"""Files of the package, and lines of one. 138 until verdicts had to hold: notices, two screenings, rows of a table,
+sample, covariance, attitudes, residuals, consensus of subsets and the sensor's own triad are concepts of their own."""
 
 FLOW = {
-    "calibrate": (42, 76),  # files and pairs of files; 61 and 101 in the first version
-    "detect": (38, 59),  # 58 and 89
-    "fleet": (37, 46),  # 56 and 69
+    "calibrate": (45, 82),  # files and pairs of files; 61 and 101 in the first version
+    "detect": (44, 75),  # 58 and 89
+    "fleet": (43, 64),  # 56 and 69
     "benchmark": (28, 64),  # 59 and 64
 }
 RETURNS = 67

@@ -18,8 +18,8 @@ from accelcal_cli.schema import Checked, setting
 if TYPE_CHECKING:  # the help of `accelcal export` does not wait for numpy
     from accelcal_cli.arrays import Float
     from accelcal_cli.calibration.result import Calibration
-    from accelcal_cli.exporters.diagonal import Triad
     from accelcal_cli.sensor.model import ErrorModel
+    from accelcal_cli.sensor.triad import Triad
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -189,14 +189,14 @@ class DiagonalExporter(DriverExporter):
 
     def triad(self, result: Calibration) -> tuple[Float, Triad]:
         """Return the offset, m/s^2, shape (3,), and the triad of readings in m/s^2."""
-        from accelcal_cli.exporters.diagonal import Triad
+        from accelcal_cli.sensor.triad import Triad
 
         model = self.in_metres(result)
         return model.D, Triad.of(model.K)
 
     def notes(self, result: Calibration) -> list[str]:
         """Return lines for the file: the error that is left, the mounting where it is known, and the warnings."""
-        from accelcal_cli.exporters.diagonal import Triad
+        from accelcal_cli.sensor.triad import Triad
 
         triad, metres = Triad.of(result.K_a), result.g * metres_per_unit(result)
         mounting = self._mounting(result, triad)
@@ -209,7 +209,7 @@ class DiagonalExporter(DriverExporter):
 
     def warnings(self, result: Calibration) -> tuple[str, ...]:
         """Return the misalignments and the mounting that are left out, and what all formats leave out."""
-        from accelcal_cli.exporters.diagonal import Triad, angle
+        from accelcal_cli.sensor.triad import Triad, angle
 
         triad = Triad.of(result.K_a)
         turned = triad.mirrored or angle(triad.axes) > STRAIGHT
