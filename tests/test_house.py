@@ -19,10 +19,8 @@ FILES, LINES = 155, 600
 screening, weights, ...) and the texts that devices write (clock, preamble, roles, vocabulary, ...)."""
 
 FLOW = {
-    "calibrate": (
-        51,
-        95,
-    ),  # files and pairs of files; 61 and 101 in the first version, 36 and 61 in the new house
+    # files and pairs of files; 61 and 101 in the first version, 36 and 61 in the new house
+    "calibrate": (51, 95),
     "detect": (51, 88),  # 58 and 89; 35 and 52
     "fleet": (49, 78),  # 56 and 69; 34 and 46
     "benchmark": (28, 64),  # 59 and 64; 26 and 59

@@ -97,8 +97,7 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
 
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
-    fit, settings, search = assessment.fit, assessment.fit.settings, assessment.fit.search
-    model = ErrorModel(fit.K[at], fit.D[at])
+    fit, model = assessment.fit, ErrorModel(assessment.fit.K[at], assessment.fit.D[at])
     return Calibration(
         K_a=model.K,
         D_a=model.D,
@@ -113,7 +112,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         reasons=assessment.reasons[at],
         suggestions=assessment.suggestions[at],
         warnings=assessment.warnings[at],
-        cost_search=float(search.cost[at]),
+        cost_search=float(fit.search.cost[at]),
         cost=float(fit.value[at]),
         rms=float(fit.rms[at]),
         rms_before=float(fit.rms_before[at]),
@@ -125,18 +124,18 @@ def record(assessment: Assessment, at: int) -> Calibration:
         covariance=fit.covariance[at],
         information=fit.information[at],
         nominal_scale=np.array(fit.nominal[at]),
-        nominal_bias=np.array(settings.nominal.bias) if settings.nominal else np.zeros(3),
+        nominal_bias=np.array(fit.settings.nominal.bias) if fit.settings.nominal else np.zeros(3),
         poses=int(fit.sample.poses[at]),
         attitudes=int(fit.geometry.attitudes[at]),
-        evaluations=int(search.evaluations[at]),
-        runs=search.runs,
-        runs_agreeing=int(search.agreeing[at]),
+        evaluations=int(fit.search.evaluations[at]),
+        runs=fit.search.runs,
+        runs_agreeing=int(fit.search.agreeing[at]),
         poses_fit=_pose_fits(assessment, at),
         outliers=assessment.outliers[at],
-        convergence=_curve(search, at),
-        optimizer=search.optimizer,
+        convergence=_curve(fit.search, at),
+        optimizer=fit.search.optimizer,
         settings=_settings_record(assessment, at),
-        g=settings.g,
+        g=fit.settings.g,
         data=_origin(fit.sample.readings(at)),
         notes=_notes(assessment, at),
         version=__version__,

@@ -82,7 +82,7 @@ def command(
     Shows which pose is held, whether it is still, and what is missing. Each pose that is held still is averaged into
     one row of the table for accelcal calibrate, written at once. Ctrl-C, a closed terminal, the end of the input and a
     lost port end it early; the poses taken until then are kept. Exit code 1 means that the input
-    ended before all poses were taken.
+    ended before all poses were taken, or that they show a fault: a dead axis, clipping, no gravity.
     """
     from accelcal_cli.detection.capture import Capture
     from accelcal_cli.io.serial import file_lines, port_lines, readings
@@ -166,6 +166,7 @@ def _offset(text: str | None) -> Float | None:
 
 def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) -> None:
     """Watch the readings to the end, whatever it is, and keep the poses; then say how it ended."""
+    from accelcal_cli.notices import are_serious
     from accelcal_cli.output.live import PoseFile, Watch
 
     ending: AccelcalError | Interrupted | None = None
@@ -181,12 +182,13 @@ def _run(capture: Capture, readings: Iterator[Float], output: str, quiet: bool) 
             file.save(capture.poses, last=True)
         except OutputError as error:
             ending = error
-    summary = _summary(capture, file)
+    summary, notices = _summary(capture, file), capture.notices()
+    options.warn(output if file.path != "-" else "<stdout>", notices, quiet)
     if ending is not None:
         ending.args = (f"{ending}; {summary}",)
         raise ending
     options.tell([summary], quiet)
-    if capture.missing():
+    if capture.missing() or are_serious(notices):
         raise typer.Exit(INCOMPLETE)
 
 

@@ -54,10 +54,6 @@ def several_of(names: Iterable[str] | Callable[[], Iterable[str]]) -> Complete:
     return complete
 
 
-BASES = ("base", "diagonal")
-"""Modules of a registry that hold what its classes derive from, and none of them."""
-
-
 def classes_in(package: str, group: str) -> list[str]:
     """Return the names in a registry without importing a class: help and a shell that completes do not wait for numpy.
 
@@ -65,7 +61,7 @@ def classes_in(package: str, group: str) -> list[str]:
         package, group: of the registry, see `registry.Registry`.
     """
     modules = (module.name for module in pkgutil.iter_modules(import_module(package).__path__))
-    names = {name.replace("_", "-") for name in modules if name not in BASES}
+    names = {name.replace("_", "-") for name in modules if name != "base"}
     if is_mentioned(group):
         from importlib.metadata import entry_points
 

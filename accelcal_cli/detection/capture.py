@@ -13,6 +13,9 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.io.rows import zero_rows
+from accelcal_cli.io.screening import Screened
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import check_unit
 
 STILL = 0.01
@@ -23,6 +26,9 @@ NEAR = 20.0
 
 SAME = 10.0
 """Degrees within which a pose counts as one that is captured already."""
+
+SCREENED, NAMES = 3, ("Nx", "Ny", "Nz")
+"""Fewest poses that are screened, and the columns of their table."""
 
 SPHERE_PRIOR = 1e-3
 """Weight of the origin as centre of the sphere, relative to that of the poses."""
@@ -204,6 +210,26 @@ class Capture:
         """
         matches = [_nearest(direction, self.planned) for direction in self.directions()]
         return [index if angle < NEAR else None for index, angle in matches]
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Return what the captured poses show that no sensor at rest shows; nothing of fewer than SCREENED."""
+        if len(self.poses) < SCREENED:
+            return ()
+        means = np.array([pose.mean for pose in self.poses])
+        real = np.flatnonzero(means.any(axis=1))
+        zeros = zero_rows(len(means) - len(real), "", len(real))
+        if len(real) < SCREENED:
+            return zeros
+        screened = Screened(
+            means[real],
+            NAMES,
+            len(real),
+            lambda pose: f"pose {real[pose] + 1}",
+            single=False,
+            count=np.array([pose.n for pose in self.poses], dtype=float)[real],
+            scatter=np.array([pose.spread for pose in self.poses])[real],
+        )
+        return (*screened.notices(), *zeros)
 
     def missing(self) -> list[int]:
         """Return the planned poses that are not captured yet."""

@@ -8,15 +8,14 @@ same sign: AccelCalibrator fits diag * (reading + offset) and saves minus its of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import EXPORTERS, INSTANCE
-from accelcal_cli.exporters.diagonal import DiagonalExporter
+from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
 from accelcal_cli.schema import setting
-from accelcal_cli.sensor.poses import AXES
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 LARGEST_OFFSET, SCALES = 3.5, (0.8, 1.2)
 """What ArduPilot's parameters may be, m/s^2 and 1: beyond, it refuses to arm."""
@@ -38,6 +37,8 @@ class ArduPilot(DiagonalExporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
+        from accelcal_cli.sensor.poses import AXES
+
         offset, triad = self.triad(result)
         header = [
             *base.origin(result),
@@ -56,9 +57,7 @@ class ArduPilot(DiagonalExporter):
         """Return what is left out, and whether ArduPilot would refuse the parameters."""
         offset, triad = self.triad(result)
         scale = triad.scale
-        usual = (
-            np.abs(offset).max() <= LARGEST_OFFSET and SCALES[0] <= scale.min() <= scale.max() <= SCALES[1]
-        )
+        usual = abs(offset).max() <= LARGEST_OFFSET and SCALES[0] <= scale.min() <= scale.max() <= SCALES[1]
         refused = (
             f"ArduPilot expects offsets up to {LARGEST_OFFSET:g} m/s^2 and "
             f"scales of {SCALES[0]:g} to {SCALES[1]:g}"

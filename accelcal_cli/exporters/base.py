@@ -9,16 +9,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
 from accelcal_cli.schema import Checked, setting
-from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY, ErrorModel, sensitivity
+
+if TYPE_CHECKING:  # the help of `accelcal export` does not wait for numpy
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.sensor.model import ErrorModel
+    from accelcal_cli.sensor.triad import Triad
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -96,6 +97,8 @@ class DriverExporter(Exporter):
             UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver
                 scale that is not that of these readings.
         """
+        from accelcal_cli.sensor.model import ErrorModel, sensitivity
+
         metres = metres_per_unit(result)
         scale = sensitivity(result.K_a) / metres
         if self.driver_scale is not None:
@@ -152,15 +155,85 @@ def comment(lines: Iterable[str], mark: str = "#") -> str:
 
 def rows(matrix: Float) -> list[list[float]]:
     """Return a matrix as lists of plain numbers."""
-    return [[float(v) for v in row] for row in np.atleast_2d(matrix)]
+    return [[float(v) for v in row] for row in (matrix if matrix.ndim == 2 else [matrix])]
 
 
 def is_force(result: Calibration) -> bool:
     """Return whether the readings are specific force already, in the unit of the result."""
+    from accelcal_cli.sensor.model import sensitivity
+
     scale = sensitivity(result.K_a)
     return bool(NEAR_ONE[0] < scale.min() and scale.max() < NEAR_ONE[1])
 
 
 def metres_per_unit(result: Calibration) -> float:
     """Return how many m/s^2 one unit of the calibrated force is: 9.80665 for g, 1 for m/s^2."""
+    from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
+
     return STANDARD_GRAVITY / OUTPUT_OF_1_G[result.unit]
+
+
+STRAIGHT = 1.0
+"""Degrees between the axes of the log and the body frame up to which a mounting is not told of."""
+
+
+@dataclass(frozen=True)
+class DiagonalExporter(DriverExporter):
+    """Base of the formats of targets that correct axis by axis, know no misalignments, and turn the board afterwards.
+
+    They get the sensor's own triad of axes, and the mounting of known attitudes apart from it.
+    """
+
+    orientation: ClassVar[str]
+    """The target's parameter of the board orientation, one of ORIENTATIONS."""
+
+    def triad(self, result: Calibration) -> tuple[Float, Triad]:
+        """Return the offset, m/s^2, shape (3,), and the triad of readings in m/s^2."""
+        from accelcal_cli.sensor.triad import Triad
+
+        model = self.in_metres(result)
+        return model.D, Triad.of(model.K)
+
+    def notes(self, result: Calibration) -> list[str]:
+        """Return lines for the file: the error that is left, the mounting where it is known, and the warnings."""
+        from accelcal_cli.sensor.triad import Triad
+
+        triad, metres = Triad.of(result.K_a), result.g * metres_per_unit(result)
+        mounting = self._mounting(result, triad)
+        return [
+            "Scales: of the sensor's own axes, with the least rms error over all directions that a scale for each axis "
+            f"can leave: {triad.rms * metres:.3g} m/s^2 at 1 g, at most {triad.worst * metres:.3g} m/s^2.",
+            *(f"Mounting, not in the numbers: {text}." for text in mounting),
+            *(f"Warning: {text}." for text in self._left_out(result, triad)),
+        ]
+
+    def warnings(self, result: Calibration) -> tuple[str, ...]:
+        """Return the misalignments and the mounting that are left out, and what all formats leave out."""
+        from accelcal_cli.sensor.triad import Triad, angle
+
+        triad = Triad.of(result.K_a)
+        turned = triad.mirrored or angle(triad.axes) > STRAIGHT
+        mounting = self._mounting(result, triad) if turned else ()
+        told = (f"the mounting is not in the numbers: {text}" for text in mounting)
+        return (*self._left_out(result, triad), *told)
+
+    def _mounting(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
+        return (triad.in_words(self.orientation),) if is_mounted(result) else ()
+
+    def _left_out(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
+        from accelcal_cli.sensor.model import AXIS_PAIRS, MRAD, misalignment
+        from accelcal_cli.sensor.poses import AXES
+
+        further = super().warnings(result)
+        if result.held.any():
+            return further
+        missed, metres = misalignment(result.K_a), result.g * metres_per_unit(result)
+        k = int(abs(missed).argmax())
+        i, j = AXIS_PAIRS[k]
+        size = abs(float(missed[k]))
+        return (
+            f"this format has no misalignments: axes {AXES[i]} and {AXES[j]} miss 90 degrees by {size * MRAD:.3g} "
+            f"mrad ({size:.3f} rad), an error of {triad.rms * metres:.2g} m/s^2 rms over all directions and up to "
+            f"{triad.worst * metres:.2g} m/s^2 at 1 g",
+            *further,
+        )

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
-from accelcal_cli.sensor.model import sensitivity
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 FORMAT = "2.0.0"
 
@@ -31,6 +31,10 @@ class Imucal(Exporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the record as JSON."""
+        import numpy as np
+
+        from accelcal_cli.sensor.model import sensitivity
+
         scale = sensitivity(result.K_a)
         record = {
             "cal_type": "Ferraris",

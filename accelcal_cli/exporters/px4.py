@@ -7,13 +7,14 @@ It does so axis by axis, after the driver's own rotation, and turns the board af
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.exporters import base
-from accelcal_cli.exporters.base import EXPORTERS, INSTANCE
-from accelcal_cli.exporters.diagonal import DiagonalExporter
+from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
 from accelcal_cli.schema import setting
-from accelcal_cli.sensor.poses import AXES
+
+if TYPE_CHECKING:
+    from accelcal_cli.calibration.result import Calibration
 
 REAL32 = 9  # MAV_PARAM_TYPE_REAL32
 
@@ -34,6 +35,8 @@ class Px4(DiagonalExporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
+        from accelcal_cli.sensor.poses import AXES
+
         offset, triad = self.triad(result)
         name = f"CAL_ACC{self.instance}"
         header = [

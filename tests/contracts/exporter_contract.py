@@ -23,8 +23,8 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.cli.export import command
 from accelcal_cli.errors import UsageError
 from accelcal_cli.exporters.base import EXPORTERS, Exporter
-from accelcal_cli.exporters.diagonal import Triad
 from accelcal_cli.notices import Notice
+from accelcal_cli.sensor.triad import Triad
 
 READING = np.array([[0.3, -4.0, 8.9], [1.0, 9.7, -0.2], [-5.0, 5.0, -6.0]])
 """Readings of a sensor in m/s^2, shape (3, 3)."""

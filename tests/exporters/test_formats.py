@@ -17,12 +17,12 @@ from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, UsageError
 from accelcal_cli.exporters.base import EXPORTERS
-from accelcal_cli.exporters.diagonal import Triad
 from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.notices import Notice
 from accelcal_cli.schema import from_mapping
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
+from accelcal_cli.sensor.triad import Triad
 
 G = 9.8
 COUNTS = ErrorModel(415.0 * MEMS.K, 415.0 * MEMS.D + 120.0)

@@ -32,6 +32,24 @@ def test_poses_from_standard_input_calibrate(run, tmp_path):
     assert "verdict,good" in calibrated.out
 
 
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda row: [row[0], row[1], 0.5], 'Column "Nz" is 0.5 in every pose'),
+        (lambda row: [min(row[0], 0.4), row[1], row[2]], 'Clipped readings: column "Nx" at 0.4'),
+    ],
+    ids=["dead axis", "clipped"],
+)
+def test_poses_that_show_a_fault_are_told_and_kept(run, spoil, said):
+    """A fault shows before the sensor is put away."""
+    rows = [spoil([float(v) for v in line.split()]) for line in stream(12).decode().splitlines()]
+    spoiled = "".join(f"{x} {y} {z}\n" for x, y, z in rows).encode()
+    done = run("capture", *FAST, "-o", "poses.csv", stdin=spoiled)
+    assert done.code == 1
+    assert f"accelcal: poses.csv: warning: {said}" in done.err
+    assert "poses in poses.csv" in done.err
+
+
 def test_the_table_may_go_on_through_a_pipe(run):
     done = run("capture", *FAST, "-q", stdin=stream(12))
     assert (done.code, done.err) == (0, "")

@@ -14,14 +14,10 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.exporters import base
-from accelcal_cli.sensor.model import AXIS_PAIRS, MRAD, misalignment
 from accelcal_cli.sensor.poses import AXES
 
 ROUNDS, SETTLED = 200, 1e-15
@@ -30,9 +26,6 @@ need about ten."""
 
 NEAR = 5.0
 """Degrees from an orientation that the target has a name for, up to which a mounting is said to be that one."""
-
-STRAIGHT = 1.0
-"""Degrees between the axes of the log and the body frame up to which a mounting is not told of."""
 
 ORIENTATIONS = (
     (0, 0, 0), (0, 0, 45), (0, 0, 90), (0, 0, 135), (0, 0, 180), (0, 0, 225), (0, 0, 270), (0, 0, 315),
@@ -150,56 +143,3 @@ def roll_pitch_yaw(turn: Float) -> tuple[float, float, float]:
         roll, yaw = math.atan2(turn[2, 1], turn[2, 2]), math.atan2(turn[1, 0], turn[0, 0])
     # No minus before a zero.
     return tuple(round(math.degrees(v), 9) + 0.0 for v in (roll, pitch, yaw))  # type: ignore[return-value]
-
-
-@dataclass(frozen=True)
-class DiagonalExporter(base.DriverExporter):
-    """Base of the formats of targets that correct axis by axis, know no misalignments, and turn the board afterwards.
-
-    They get the sensor's own triad of axes, and the mounting of known attitudes apart from it.
-    """
-
-    orientation: ClassVar[str]
-    """The target's parameter of the board orientation, one of ORIENTATIONS."""
-
-    def triad(self, result: Calibration) -> tuple[Float, Triad]:
-        """Return the offset, m/s^2, shape (3,), and the triad of readings in m/s^2."""
-        model = self.in_metres(result)
-        return model.D, Triad.of(model.K)
-
-    def notes(self, result: Calibration) -> list[str]:
-        """Return lines for the file: the error that is left, the mounting where it is known, and the warnings."""
-        triad, metres = Triad.of(result.K_a), result.g * base.metres_per_unit(result)
-        mounting = self._mounting(result, triad)
-        return [
-            "Scales: of the sensor's own axes, with the least rms error over all directions that a scale for each axis "
-            f"can leave: {triad.rms * metres:.3g} m/s^2 at 1 g, at most {triad.worst * metres:.3g} m/s^2.",
-            *(f"Mounting, not in the numbers: {text}." for text in mounting),
-            *(f"Warning: {text}." for text in self._left_out(result, triad)),
-        ]
-
-    def warnings(self, result: Calibration) -> tuple[str, ...]:
-        """Return the misalignments and the mounting that are left out, and what all formats leave out."""
-        triad = Triad.of(result.K_a)
-        turned = triad.mirrored or angle(triad.axes) > STRAIGHT
-        mounting = self._mounting(result, triad) if turned else ()
-        told = (f"the mounting is not in the numbers: {text}" for text in mounting)
-        return (*self._left_out(result, triad), *told)
-
-    def _mounting(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
-        return (triad.in_words(self.orientation),) if base.is_mounted(result) else ()
-
-    def _left_out(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
-        further = super().warnings(result)
-        if result.held.any():
-            return further
-        missed, metres = misalignment(result.K_a), result.g * base.metres_per_unit(result)
-        k = int(np.abs(missed).argmax())
-        i, j = AXIS_PAIRS[k]
-        size = abs(float(missed[k]))
-        return (
-            f"this format has no misalignments: axes {AXES[i]} and {AXES[j]} miss 90 degrees by {size * MRAD:.3g} "
-            f"mrad ({size:.3f} rad), an error of {triad.rms * metres:.2g} m/s^2 rms over all directions and up to "
-            f"{triad.worst * metres:.2g} m/s^2 at 1 g",
-            *further,
-        )

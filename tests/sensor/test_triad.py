@@ -10,10 +10,10 @@ from simulated import noise
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.exporters.base import EXPORTERS
-from accelcal_cli.exporters.diagonal import ORIENTATIONS, Triad, angle, roll_pitch_yaw, rotation
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
+from accelcal_cli.sensor.triad import ORIENTATIONS, Triad, angle, roll_pitch_yaw, rotation
 
 G = 9.80665
 OWN = to_gauge(np.array([[1.013, 0, 0], [0.004, 0.991, 0], [-0.006, 0.008, 1.021]]), "symmetric")
