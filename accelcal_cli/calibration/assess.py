@@ -360,8 +360,8 @@ def _large_misalignment(angle: float) -> tuple[Notice, ...]:
 def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return a warning of residuals far below the noise that the scatter within the poses predicts."""
     ratio, chance = float(fit.spread.ratio[at]), float(fit.spread.p_less[at])
-    rounding_alone = not fit.s[at] > NO_NOISE * fit.settings.g
-    if not (ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at) or rounding_alone:
+    told = fit.sample.labelled[at] and fit.s[at] > NO_NOISE * fit.settings.g  # rows of a pose, and no rounding
+    if not (told and ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at):
         return ()
     text = (
         f"The residuals are {ratio:.2g} times what the scatter within the poses predicts: readings of two sensors are "
