@@ -31,7 +31,7 @@ KEYS = {
     *("log", "several-sensors", "duplicate-rows", "zero-rows", "frozen", "clipped", "gravity-removed"),
     *("never-moved", "wrong-gravity", "outliers", "large-misalignment", "residuals", "noise-bias", "tremor"),
     *("correlated", "unequal-noise", "few-attitudes", "box", "thousands", "dead-axis", "unfinished-search"),
-    *("perpendicular", "negative-axes", "legacy", "unit"),
+    *("perpendicular", "negative-axes", "legacy", "unit", "suspect-result"),
 }
 """Those that programs may rely on."""
 
@@ -175,8 +175,8 @@ def _made():
                     yield tuple(stated)
 
 
-ELSEWHERE = {("correlated", "warning")}
-"""Made by groups of rows that are fewer than few attitudes."""
+ELSEWHERE = {("correlated", "warning"), ("suspect-result", "note")}
+"""Made by groups of rows that are fewer than few attitudes, and by verify, whose own test has it."""
 
 
 def test_a_notice_is_its_sentence_and_what_to_do():
