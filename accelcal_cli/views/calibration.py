@@ -202,15 +202,16 @@ def fit(result: Calibration) -> Table:
 
 
 def observability(result: Calibration) -> Table:
-    """Return the dilution of precision of each parameter."""
+    """Return the dilution of precision of each parameter by the distinct attitudes, which the verdict rests on."""
     rows: list[tuple[object, ...]] = []
-    for (name, dop), held in zip(result.dop.parameters.items(), result.held, strict=True):
+    for (name, dop), held in zip(result.geometry.parameters.items(), result.held, strict=True):
         word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
         size = dop if np.isfinite(dop) else "infinite"
         rows.append((name, "-", ASSUMED) if held else (name, size, word))
     notes = (
         "Dilution of precision: parameter error divided by the noise of one pose "
-        f"(as {result.unit} at 1 g). Above {WEAK:g} weak, above {UNDETERMINED:g} undetermined.",
+        f"(as {result.unit} at 1 g), of the distinct attitudes; more than twelve count as twelve of their kind. Above "
+        f"{WEAK:g} weak, above {UNDETERMINED:g} undetermined.",
     )
     columns = (Column("parameter"), Column("DOP", format=".3f"), Column(""))
     return Table("Observability", columns, tuple(rows), notes)
