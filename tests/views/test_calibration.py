@@ -93,8 +93,8 @@ def test_a_result_in_units_of_g():
 
 def test_the_observability_table_is_the_dilution(result):
     rows = _cells(tables.observability(result))
-    assert list(rows) == list(result.dop.parameters)
-    for name, dop in result.dop.parameters.items():
+    assert list(rows) == list(result.geometry.parameters)
+    for name, dop in result.geometry.parameters.items():
         assert rows[name][0] == dop
         assert rows[name][1] == "good"
 
