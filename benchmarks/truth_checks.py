@@ -8,7 +8,6 @@ test.
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from accelcal_cli.errors import AccelcalError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.verification.verify import verify
 from benchmarks.truth_coverage import Slopes, scene_of, settings
 from benchmarks.truth_scenes import (
     MILLI_G,
@@ -312,18 +312,9 @@ def answer(
     slopes = Slopes(1e-4 * rng.normal(size=3), 0.2 * MILLI_G * scene.size * rng.normal(size=3))
     try:
         result = calibrate(old.readings(scene, model, slopes), settings(scene.g, **stated))
-        return str(_verify(result, new.readings(scene, change(model, rng), slopes)).verdict)
+        return str(verify(result, new.readings(scene, change(model, rng), slopes)).verdict)
     except AccelcalError:
         return "refused"
-
-
-def _verify(result: Calibration, readings: Readings) -> Any:
-    for home in ("accelcal_cli.verification", "accelcal_cli.verification.verify"):
-        try:
-            return importlib.import_module(home).verify(result, readings)
-        except AttributeError:
-            continue
-    raise ImportError("verify: not found")
 
 
 def remounted(model: ErrorModel, rng: Generator) -> ErrorModel:

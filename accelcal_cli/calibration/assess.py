@@ -15,7 +15,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.consensus import consensus
 from accelcal_cli.calibration.distributions import chi_square_chance
-from accelcal_cli.calibration.fit import NOTABLE_BIAS, Fit
+from accelcal_cli.calibration.fit import NOTABLE_BIAS, Fit, edge_names
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     FEWEST_POSES,
@@ -147,7 +147,7 @@ def assess(fit: Fit) -> Assessment:
 
 
 def _unchecked(fit: Fit) -> Bool:
-    """Return which of the kept poses no other checks where that matters, shape (R, k): few, without scatter."""
+    """Return which of the kept poses no other checks, of few without scatter, shape (R, k)."""
     asked = (fit.freedom >= 1) & (fit.freedom <= FEW_TO_CHECK) & np.isnan(fit.spread.ratio)
     asked &= fit.solution is not None
     return np.asarray((fit.residuals.leverage >= CHECKABLE) & fit.residuals.real & asked[:, None])
@@ -215,12 +215,6 @@ def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[
     if beyond and view.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
         lines.append(f"The least cost lies outside the search box, beyond {beyond}.")
     return suggestions, tuple(lines)
-
-
-def edge_names(at_wall: Bool) -> tuple[str, ...]:
-    """Return the names of the unknowns that are at a wall of the box, of those marked in shape (D,)."""
-    matrix = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: len(at_wall) - 3]
-    return tuple(n for n, at in zip((*matrix, "D_1", "D_2", "D_3"), at_wall, strict=True) if at)
 
 
 def _to_gain(fit: Fit) -> Float:
@@ -360,7 +354,9 @@ def _large_misalignment(angle: float) -> tuple[Notice, ...]:
 def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return a warning of residuals far below the noise that the scatter within the poses predicts."""
     ratio, chance = float(fit.spread.ratio[at]), float(fit.spread.p_less[at])
-    told = fit.sample.labelled[at] and fit.s[at] > NO_NOISE * fit.settings.g  # rows of a pose, and no rounding
+    told = (
+        fit.sample.labelled[at] and fit.s[at] > NO_NOISE * fit.settings.g
+    )  # rows of a pose, and no rounding
     if not (told and ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at):
         return ()
     text = (
@@ -384,8 +380,13 @@ def _noise_bias(fit: Fit, at: int) -> tuple[Notice, ...]:
         )
         remedy = "Average the readings of each pose first (a column that labels the pose)."
         return (Notice("noise-bias", "warning", text, remedy),)
-    text = f"Noise biases the parameters by more than {NOTABLE_BIAS:g} sigma; that is taken off."
-    return (Notice("noise-bias", "note", text),)
+    return (
+        Notice(
+            "noise-bias",
+            "note",
+            f"Noise biases a parameter by over {NOTABLE_BIAS:g} sigma; that is taken off.",
+        ),
+    )
 
 
 def _shakes(fit: Fit, at: int) -> bool:

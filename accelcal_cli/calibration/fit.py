@@ -237,6 +237,10 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
         w = solution.stated.weights
         w = solution.sample.real(0, u.shape[1]).astype(float) if w is None else w
         own = noise_bias(u, w, noise.covariance, cofactor, g)
+        # A vibration scatters the readings and averages out: their means are less noisy than the scatter says.
+        expected = np.sum(w * noise.variance, axis=1) / solution.sample.poses
+        with np.errstate(divide="ignore", invalid="ignore"):
+            own = own * np.fmin(1.0, variance / expected)[:, None]
         bias = np.where(noise.known[:, None], own, bias)
         part = np.where(noise.known, KNOWN_BIAS, part)
     sigma = np.sqrt(variance[:, None] * np.einsum("rpp->rp", cofactor))
@@ -383,6 +387,12 @@ def _at_wall(x: Float) -> Bool:
     if x.shape[-1] == 12:
         edge[..., 3:9] = False
     return edge
+
+
+def edge_names(at_wall: Bool) -> tuple[str, ...]:
+    """Return the names of the unknowns that are at a wall of the box, of those marked in shape (D,)."""
+    matrix = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: len(at_wall) - 3]
+    return tuple(n for n, at in zip((*matrix, "D_1", "D_2", "D_3"), at_wall, strict=True) if at)
 
 
 def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:

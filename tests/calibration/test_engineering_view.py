@@ -10,7 +10,7 @@ from simulated import noise, readings
 
 from accelcal_cli.calibration import observability as engineering
 from accelcal_cli.calibration.calibrate import calibrate, calibrate_many
-from accelcal_cli.calibration.fleet import calibrate_fleet, parameters
+from accelcal_cli.calibration.fleet import calibrate_fleet
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.fleet import read_fleet
 from accelcal_cli.io.readings import Readings
@@ -20,6 +20,8 @@ from accelcal_cli.views.calibration import engineering as engineering_view
 from accelcal_cli.views.calibration import values
 
 G = 9.8
+UNITS = np.repeat([1.0, 1e3, 1e6 / G], 3)
+"""Sizes of the units of a fleet's parameters: 1, mrad and micro-g."""
 SKEWED = ErrorModel(
     np.array([[103.0, 0.0, 0.0], [8.0, 98.0, 0.0], [-30.0, 20.0, 96.0]]), np.array([300.0, -150.0, 80.0])
 )
@@ -94,16 +96,16 @@ def test_a_fleet_states_the_same_quantities(tmp_path):
     records = {}
     settings = Settings(optimizer="levenberg-marquardt", g=G)
     fleet = calibrate_fleet(read_fleet([str(tmp_path / "fleet.csv")]), settings, records.__setitem__)
-    shown = parameters(fleet, G)
     for r, one in records.items():
         rows = engineering_view(one).rows
-        for p, quantity in enumerate(shown):
+        for p in range(9):
             value, sigma = rows[p][1], rows[p][2] / one.coverage_factor
             if p < 3:
                 value = (1.0 + value * 1e-6) * one.nominal_scale[p]
                 sigma = sigma * 1e-6 * one.nominal_scale[p]
-            assert quantity.values[r] == pytest.approx(value, rel=1e-9)
-            assert quantity.gain[r] * one.s == pytest.approx(sigma, rel=1e-9)
+            gain = fleet.gain[r, p] * (one.nominal_scale[p] * (1 + rows[p][1] * 1e-6) if p < 3 else UNITS[p])
+            assert fleet.parameters[r, p] == pytest.approx(value, rel=1e-9)
+            assert gain * one.s == pytest.approx(sigma, rel=1e-9)
 
 
 def test_csv_and_json_state_the_same_quantities():

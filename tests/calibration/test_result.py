@@ -120,7 +120,8 @@ def test_a_record_carries_its_units_and_origin():
     assert record["schema"] == SCHEMA
     assert record["gauge"] == "lower"
     assert record["g"] == G
-    assert set(record["data"]) == {"source", "sha256", "columns"}
+    form = {"source_format", "rows", "rows_skipped", "rate_hz", "unit"}
+    assert set(record["data"]) == {"source", "sha256", "columns"} | form
     assert record["settings"]["optimizer"] == "levenberg-marquardt"
     assert record["version"]
     assert len(record["poses_fit"]) == 24

@@ -166,7 +166,7 @@ def numbers(result):
     for row, widths, bias, width in zip(result["K_a"], half["K_a"], result["D_a"], half["D_a"], strict=True):
         yield from (f"{value:.8g}" for value in (*row, bias))
         yield from (f"{value:.2g}" for value in (*widths, width))
-    yield from (f"{dop:.3f}" for dop in result["dop"]["parameters"].values())
+    yield from (f"{dop:.3f}" for dop in result["geometry"]["parameters"].values())
     yield from (f"{result[name]:.6g}" for name in ("rms", "rms_before", "s"))
     yield f"{result['cost']:.9g}"
     yield f"{result['evaluations']:,}"
