@@ -73,8 +73,7 @@ EARTH = 9.76, 9.84
 """Gravity on Earth, m/s^2, from the top of the Andes to the Arctic Ocean."""
 
 MATTERS = 0.3
-"""Sigmas of a parameter from which on a bias that may remain is a warning: a bias of 0.3 sigma lowers the coverage of
-an interval from 95 to 94 %."""
+"""Sigmas of a parameter from which on a bias that may remain is a warning: of 0.3, an interval covers 94 %."""
 
 LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
 """Residuals of at most this part of the noise that the scatter predicts, and by chance this rarely, are told of."""
