@@ -27,6 +27,67 @@ def opened(text, *where):
     return table
 
 
+PREAMBLE = "Logger 3\nSerial: 17\nRate: 100 Hz\n\n"
+WHOLE = [f"{k % 2},{k}.5,{2 * k}.25,{k * k}.125" for k in range(1, 61)]
+HEADER = "device,ax,ay,az"
+
+
+def read(text, **options):
+    """Read what is said of device 0, in a file whose first row is on line 6."""
+    return read_readings(
+        "-", stdin=io.BytesIO(text.encode()), options=ReadOptions(where=("device=0",), **options)
+    )
+
+
+def with_preamble(rows):
+    return PREAMBLE + "\n".join([HEADER, *rows, ""])
+
+
+def test_lines_keep_their_numbers_below_a_preamble():
+    found = read(with_preamble(WHOLE))
+    assert found.poses == found.form.rows == 30
+    assert [found.where(0), found.where(29)] == ["line 7", "line 65"]
+    assert any(note.startswith("3 lines above the table skipped") for note in found.notes)
+
+
+def test_a_broken_row_is_named_by_its_line_and_left_out_on_request():
+    rows = [*WHOLE[:9], "0,1,2", *WHOLE[9:], HEADER, "1,2,x,3"]
+    with pytest.raises(DataError, match="line 15: has 3 cells"):
+        read(with_preamble(rows))
+    found = read(with_preamble(rows), skip_bad=True)
+    assert (found.poses, found.form.rows_skipped) == (30, 1)  # what is wrong with device 1 does not matter
+    assert "1 broken row left out (--skip-bad): line 15" in found.notes
+    assert [found.where(3), found.where(4)] == ["line 13", "line 16"]
+
+
+def test_too_many_broken_rows_are_refused_by_their_lines():
+    rows = list(WHOLE)
+    rows[1], rows[3], rows[5] = "0,,1,2", "0,a,1,2", "0,1"
+    with pytest.raises(DataError, match=r"3 of 30 rows are broken, more than .*: lines 7, 9, 11"):
+        read(with_preamble(rows), skip_bad=True)
+
+
+def test_a_last_line_that_is_cut_off_is_forgiven():
+    found = read(with_preamble(WHOLE) + "0,61.5,12")
+    assert (found.poses, found.form.rows_skipped) == (30, 1)
+    assert "the last line, 66, left out: it is cut off" in found.notes
+
+
+def test_columns_are_judged_by_the_rows_that_are_read():
+    """Rows of another kind, which come first, hold text where those of the sensor hold numbers."""
+    rows = [f"1,gyro,none,{k},on" if k % 2 else f"0,{k}.5,{2 * k}.25,{k * k}.125,ok" for k in range(1, 61)]
+    found = read("device,u,v,w,state\n" + "\n".join(rows) + "\n")
+    assert (found.columns, found.poses) == (("u", "v", "w"), 30)
+
+
+def test_lines_of_words_can_be_chosen_by_a_value():
+    rows = [f"dev={k % 2} ax={k}.5 ay={2 * k}.25 az={k * k}.125" for k in range(1, 61)]
+    found = read_readings(
+        "-", stdin=io.BytesIO("\n".join([*rows, ""]).encode()), options=ReadOptions(where=("dev=0",))
+    )
+    assert (found.poses, found.where(0), found.where(29)) == (30, "line 2", "line 60")
+
+
 def rows_of(table, columns=(1, 2, 3)):
     blocks = list(table.blocks(Selection(columns)))
     return np.concatenate([block.numbers for block in blocks])
