@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
-from accelcal_cli.calibration.consensus import consensus
 from accelcal_cli.calibration.distributions import chi_square_chance
 from accelcal_cli.calibration.fit import NOTABLE_BIAS, Fit, edge_names
 from accelcal_cli.calibration.observability import (
@@ -22,12 +21,12 @@ from accelcal_cli.calibration.observability import (
     SCALE,
     PoseVerdict,
     poses_to_add,
+    unit,
 )
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, pattern_chance
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
-from accelcal_cli.calibration.weights import SURELY_TREMBLES
 from accelcal_cli.notices import Notice, Severity, are_serious
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES, axis_up
@@ -178,10 +177,14 @@ def _outliers(fit: Fit) -> list[tuple[int, ...]]:
         return outliers
     bent = (fit.s > LARGE * fit.settings.g) | (outlier.sum(axis=1) > 1) | fit.at_wall.any(axis=1)
     bent &= np.array([word != "undetermined" for word in fit.geometry.observability.verdicts])
+    if not bent.any():
+        return outliers
+    from accelcal_cli.calibration.consensus import consensus
+
     for at in np.flatnonzero(bent).tolist():
-        agreement = consensus(fit.sample.take(np.array([at])), fit.settings)
-        if agreement is not None and not agreement.agreeing.all():
-            outliers[at] = tuple(np.flatnonzero(~agreement.agreeing).tolist())
+        agreeing = consensus(fit.sample.take(np.array([at])), fit.settings)
+        if agreeing is not None and not agreeing.all():
+            outliers[at] = tuple(np.flatnonzero(~agreeing).tolist())
     return outliers
 
 
@@ -230,26 +233,15 @@ def _to_gain(fit: Fit) -> Float:
     return gain
 
 
-def _sigma(fit: Fit) -> Float:
-    """Return the one-sigma of the nine parameters, m/s^2, shape (R, 9), NaN where there is none."""
-    return np.asarray(np.sqrt(np.einsum("rpp->rp", fit.covariance)))
-
-
-def _may_be_biased(fit: Fit) -> Bool:
-    """Return which sensors may keep so much of the noise bias that it matters, shape (R,)."""
-    return np.asarray((fit.bias > MATTERS * _sigma(fit)).any(axis=1))
-
-
-def _angles(fit: Fit) -> Float:
-    """Return the largest angle by which two axes of each sensor miss 90 degrees, rad, shape (R,)."""
-    rows = fit.lower / np.linalg.norm(fit.lower, axis=2, keepdims=True)
-    return np.asarray(np.abs(np.arcsin((rows @ rows.swapaxes(1, 2))[:, [1, 2, 2], [0, 0, 1]])).max(axis=1))
-
-
 def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_warnings` has something to say of, or might have, shape (R,)."""
     g, s, settings, spread = fit.settings.g, fit.s, fit.settings, fit.spread
-    noisy = (s > LARGE * g) | (fit.bias > 0).any(axis=1) | (_angles(fit) > TURNED) | (fit.clusters > 0)
+    noisy = (
+        (s > LARGE * g)
+        | (fit.bias > 0).any(axis=1)
+        | (fit.largest_misalignment > TURNED)
+        | (fit.clusters > 0)
+    )
     noisy |= (spread.ratio >= MORE_THAN_NOISE) | (spread.ratio <= LESS_THAN_NOISE)
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
@@ -270,7 +262,7 @@ def _patterns(fit: Fit) -> tuple[Float, Float]:
         return np.full(len(sample), np.nan), np.full(len(sample), np.nan)
     weights = fit.solution.robust_weights()
     w = residuals.real.astype(float) if weights is None else weights
-    u = residuals.force / np.maximum(np.linalg.norm(residuals.force, axis=2, keepdims=True), 1e-300)
+    u = unit(residuals.force)
     time = (residuals.pose / np.maximum(sample.poses[:, None] - 1, 1))[..., None]
     bent = pattern_chance(residuals, w, np.concatenate([u**3, u**4], axis=2), fit.settings.g)
     return bent, pattern_chance(residuals, w, time * u, fit.settings.g)
@@ -306,7 +298,7 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         *_few_attitudes(fit, at),
         *not_fitting(where, freedom, loss),
         *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
-        *_large_misalignment(float(_angles(fit)[at])),
+        *_large_misalignment(float(fit.largest_misalignment[at])),
     ]
     if fit.solution is None:
         return (*lines, *_turned_round(fit.K[at]))
@@ -353,9 +345,8 @@ def _large_misalignment(angle: float) -> tuple[Notice, ...]:
 def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return a warning of residuals far below the noise that the scatter within the poses predicts."""
     ratio, chance = float(fit.spread.ratio[at]), float(fit.spread.p_less[at])
-    told = (
-        fit.sample.labelled[at] and fit.s[at] > NO_NOISE * fit.settings.g
-    )  # rows of a pose, and no rounding
+    # Rows of labelled poses, and no rounding.
+    told = fit.sample.labelled[at] and fit.s[at] > NO_NOISE * fit.settings.g
     if not (told and ratio <= LESS_THAN_NOISE and chance <= SURELY_LESS) or _shakes(fit, at):
         return ()
     text = (
@@ -368,30 +359,25 @@ def _less_than_noise(fit: Fit, at: int) -> tuple[Notice, ...]:
 
 def _noise_bias(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return what was done about the noise bias, and a warning where too much of it may remain."""
-    if not (fit.bias[at] > 0).any() or not np.isfinite(_sigma(fit)[at]).any():
+    bias, sigma = fit.bias[at], fit.sigma[at]
+    if not (bias > 0).any() or not np.isfinite(sigma).any():
         return ()
-    noise = fit.s[at] / fit.settings.g
-    sizes = fit.bias[at] / np.where(_sigma(fit)[at] > 0, _sigma(fit)[at], np.inf)
-    if _may_be_biased(fit)[at]:
+    noise, left = fit.s[at] / fit.settings.g, float(np.nanmax(bias / np.where(sigma > 0, sigma, np.inf)))
+    if left > MATTERS:
         text = (
             f"Noise of {noise:.2%} of g in each reading biases the parameters; that is taken off, but "
-            f"{np.nanmax(sizes):.1f} sigma may remain."
+            f"{left:.1f} sigma may remain."
         )
         remedy = "Average the readings of each pose first (a column that labels the pose)."
         return (Notice("noise-bias", "warning", text, remedy),)
-    return (
-        Notice(
-            "noise-bias",
-            "note",
-            f"Noise biases a parameter by over {NOTABLE_BIAS:g} sigma; that is taken off.",
-        ),
-    )
+    text = f"Noise biases a parameter by over {NOTABLE_BIAS:g} sigma; that is taken off."
+    return (Notice("noise-bias", "note", text),)
 
 
 def _shakes(fit: Fit, at: int) -> bool:
     """Whether the readings of a sensor tremble in their poses."""
     tremor = None if fit.solution is None else fit.solution.stated.tremor
-    return tremor is not None and bool(tremor.certainty[at] > SURELY_TREMBLES)
+    return tremor is not None and bool(tremor.sure[at])
 
 
 def _tremor(fit: Fit, at: int) -> tuple[Notice, ...]:
@@ -402,7 +388,7 @@ def _tremor(fit: Fit, at: int) -> tuple[Notice, ...]:
     angle, g = float(tremor.angle[at]), fit.settings.g
     counted = tremor.excess[at, : int(fit.sample.poses[at])]
     short = float(np.mean(counted)) / g**2
-    least = np.nan_to_num(_sigma(fit)[at, SCALE], nan=np.inf).min()
+    least = np.nan_to_num(fit.sigma[at, SCALE], nan=np.inf).min()
     left = float(tremor.doubt[at] / least)
     text = (
         f"The sensor trembled by {angle * 1e3:.2g} mrad within the poses, which shortens their mean by "

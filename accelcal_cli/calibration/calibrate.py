@@ -14,6 +14,7 @@ from accelcal_cli import __version__
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
+from accelcal_cli.calibration.observability import unit
 from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
@@ -164,7 +165,7 @@ def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:
     real = residuals.real[at]
     output = ErrorModel(fit.lower[at], fit.D[at]).output(residuals.force[at, real])
     force = ErrorModel(K[at], D[at]).specific_force(output)
-    directions = (force / np.linalg.norm(force, axis=1, keepdims=True)).tolist()
+    directions = unit(force).tolist()
     return tuple(
         PoseFit(
             pose=int(pose),

@@ -8,13 +8,11 @@ grow: a pose that the others would not call an outlier joins them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import student_chance
-from accelcal_cli.calibration.observability import ALIGNED, design
+from accelcal_cli.calibration.observability import ALIGNED, design, unit
 from accelcal_cli.calibration.sample import NO_NOISE, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.rng import Purpose, Streams
@@ -44,21 +42,8 @@ TRIMMED = 0.607
 """Standard deviation of the smaller three quarters of normal residuals, over that of all."""
 
 
-@dataclass(frozen=True, eq=False)
-class Consensus:
-    """What most poses of one sensor agree on.
-
-    Attributes:
-        agreeing: which poses do, shape (J,).
-        s: standard deviation of their residuals, m/s^2.
-    """
-
-    agreeing: Bool
-    s: float
-
-
-def consensus(sample: Sample, settings: Settings) -> Consensus | None:
-    """Return the consensus of the poses of one sensor; None where they are too few for one, or have none."""
+def consensus(sample: Sample, settings: Settings) -> Bool | None:
+    """Return which poses of one sensor agree, shape (J,); None where they are too few to tell, or none do."""
     N = sample.output()[0, : int(sample.poses[0])]
     columns = np.flatnonzero(~ALIGNED) if not settings.misalignment else np.arange(9)
     free = len(columns)
@@ -74,13 +59,7 @@ def consensus(sample: Sample, settings: Settings) -> Consensus | None:
         looked = np.sort(np.argsort(random.uniform(1, len(x))[0, 0], kind="stable")[:LOOKED_AT])
     terms = _terms(x[looked])[:, columns]  # in the order of the parameters that they determine
     subset = _best_subset(terms, random)
-    if subset is None:
-        return None
-    kept = _grown(x, looked[subset], columns)
-    if kept is None:
-        return None
-    agreeing, s = kept
-    return Consensus(agreeing, s * settings.g)
+    return None if subset is None else _grown(x, looked[subset], columns)
 
 
 def _terms(x: Float) -> Float:
@@ -145,8 +124,8 @@ def _best_subset(terms: Float, random: Streams) -> Int | None:
     return np.flatnonzero(member[at]) if np.isfinite(objective[at]) else None
 
 
-def _grown(x: Float, start: Int, columns: Int) -> tuple[Bool, float] | None:
-    """Return which of all rows agree, shape (J,), and the standard deviation of their e / g.
+def _grown(x: Float, start: Int, columns: Int) -> Bool | None:
+    """Return which of all rows agree, shape (J,), from those that surely do; None where these fix no ellipsoid.
 
     Args:
         x: readings, shape (J, 3); start: numbers of rows that agree; columns: of the free parameters.
@@ -162,10 +141,9 @@ def _grown(x: Float, start: Int, columns: Int) -> tuple[Bool, float] | None:
         e = _errors(terms, y)[0]
         if not np.isfinite(e).all() or count <= free:
             return None
-        s = float(np.sqrt(np.sum(e[agreeing] ** 2) / (count - free))) / scale
+        s = max(float(np.sqrt(np.sum(e[agreeing] ** 2) / (count - free))) / scale, NO_NOISE)
         leverage = _leverage(x, y[0], agreeing, columns)
         room = np.where(agreeing, np.maximum(1.0 - leverage, 1e-9), 1.0 + leverage)
-        s = max(s, NO_NOISE)
         t = np.abs(e) / (s * np.sqrt(room))
         chance = student_chance(np.maximum(t, 1e-9), np.full(poses, max(count - free, 1)))
         grown = poses * chance >= LEVEL
@@ -173,7 +151,7 @@ def _grown(x: Float, start: Int, columns: Int) -> tuple[Bool, float] | None:
         if (grown == agreeing).all():
             break
         agreeing = grown
-    return agreeing, s
+    return agreeing
 
 
 def _leverage(x: Float, y: Float, agreeing: Bool, columns: Int) -> Float:
@@ -184,7 +162,7 @@ def _leverage(x: Float, y: Float, agreeing: Bool, columns: Int) -> Float:
         A[[0, 0, 1], [1, 2, 2]] = A[[1, 2, 2], [0, 0, 1]] = y[3:6]
     centre = -np.linalg.solve(A, y[p - 3 :])
     f = (x - centre) @ np.linalg.cholesky(A)
-    rows = design(f / np.linalg.norm(f, axis=1, keepdims=True))[:, columns]
+    rows = design(unit(f))[:, columns]
     normal = rows[agreeing].T @ rows[agreeing]
     # What the agreeing rows leave open has a huge leverage: no row disagrees there.
     cofactor = np.linalg.inv(normal + OPEN * np.trace(normal) * np.eye(len(columns)))

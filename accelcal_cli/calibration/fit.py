@@ -31,6 +31,7 @@ from accelcal_cli.calibration.observability import (
     design,
     moved_sensor,
     propagate,
+    unit,
 )
 from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, length_error, pose_residuals, worst
 from accelcal_cli.calibration.result import Temperature
@@ -38,7 +39,7 @@ from accelcal_cli.calibration.sample import NO_NOISE, Sample, loss_slope, loss_w
 from accelcal_cli.calibration.search import SLOPES, Search, Solution
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.weights import directions
-from accelcal_cli.sensor.model import Gauge, to_gauge
+from accelcal_cli.sensor.model import Gauge, misalignment, to_gauge
 
 EDGE = 1e-6
 """A parameter within this part of a half-width from the wall of its box is at the edge."""
@@ -117,6 +118,16 @@ class Fit:
     def coverage(self) -> Float:
         """Factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`."""
         return coverage_of(self.spread.freedom)
+
+    @cached_property
+    def sigma(self) -> Float:
+        """One-sigma of the nine parameters, m/s^2, shape (R, 9), NaN where there is none."""
+        return np.asarray(np.sqrt(np.einsum("rpp->rp", self.covariance)))
+
+    @cached_property
+    def largest_misalignment(self) -> Float:
+        """Largest angle by which two axes miss 90 degrees, rad, shape (R,)."""
+        return np.asarray(np.abs(misalignment(self.lower)).max(axis=1))
 
     @property
     def temperature(self) -> Temperature | None:
@@ -207,14 +218,14 @@ def fit(solution: Solution) -> Fit:
 
 def _point(solution: Solution, held: Bool | None) -> _Point:
     """Return the sensors at the least cost."""
-    sample, rejected = solution.sample, solution.stated.rejected
+    sample = solution.sample
     K, D = solution.cost.parameters(solution.x)
     nine, x = solution.plain.in_lower(K, D)
     slopes = solution.slopes
     information = nine.information(x) - (0.0 if slopes is None else slopes.loss)
     observability = Observability.of(information, sample.poses, held)
     unknowns = min(9, solution.cost.unknowns) + SLOPES * (slopes is not None)
-    counted = sample.poses - (0 if rejected is None else rejected.sum(axis=1))
+    counted = solution.stated.counted()
     lower, bias = nine.parameters(x)[0], np.zeros((len(sample), 9))
     return _Point(K, D, lower, information, observability, counted - unknowns, bias)
 
@@ -234,8 +245,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     part = np.full(len(bias), SUPPOSED_BIAS)
     if noise is not None and noise.known.any():
         u = directions(solution.sample, point.lower, point.D)
-        w = solution.stated.weights
-        w = solution.sample.real(0, u.shape[1]).astype(float) if w is None else w
+        w = solution.stated.each_weight()
         own = noise_bias(u, w, noise.covariance, cofactor, g)
         # A vibration scatters the readings and averages out: their means are less noisy than the scatter says.
         expected = np.sum(w * noise.variance, axis=1) / solution.sample.poses
@@ -276,7 +286,7 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
     clusters = np.zeros(len(sample), dtype=np.intp)
     if stated.noise is not None and solution.noise is None:
         u = directions(sample, point.lower, point.D)
-        w = sample.real(0, u.shape[1]).astype(float) if stated.weights is None else stated.weights
+        w = stated.each_weight()
         rows = design(u) if solution.slopes is None else solution.slopes.rows
         spread = scattered_spread(spread, rows, w, cofactor, stated.noise, freedom)
         if stated.own is not None:
@@ -306,11 +316,11 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
     place, last, count = slice(at, at + 1), None, 0
     sensor = point.lower[place], point.D[place], solution.stated.settings.g
     for _, _, f in sample.errors(*sensor):
-        u = f[0] / np.linalg.norm(f[0], axis=1, keepdims=True)
+        u = unit(f[0])
         count, last = count + int(jumps(u, last).sum()), u[-1]
     clusters = Clusters.of(int(sample.poses[0]), count)
     for first, e, f in sample.errors(*sensor):
-        u = f[0] / np.linalg.norm(f[0], axis=1, keepdims=True)
+        u = unit(f[0])
         w = np.ones(len(u)) if weights is None else weights[at, first : first + len(u)]
         clusters.add(np.ascontiguousarray(u), np.sqrt(w) * e[0], w)
     return clusters
@@ -333,7 +343,7 @@ def _geometry(
     else:
         cells = [CellCount() for _ in range(len(sample))]
         for first, _, f in sample.errors(*sight, solution.stated.settings.g):
-            u = f / np.linalg.norm(f, axis=2, keepdims=True)
+            u = unit(f)
             real = sample.real(first, f.shape[1])
             for at, cell in enumerate(cells):
                 cell.add(u[at, real[at]])
@@ -405,8 +415,7 @@ def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:
     room = np.where(freedom > 0, freedom, np.nan)
     if _robust(solution) is None:
         return np.asarray(solution.value / (4.0 * solution.stated.settings.g**2) / room)  # L = sum (2 g e)^2
-    rejected = solution.stated.rejected
-    poses = solution.sample.poses - (0 if rejected is None else rejected.sum(axis=1))
+    poses = solution.stated.counted()
     mean = sums[4] / poses
     unequal = np.maximum(sums[5] / poses / mean**2 - 1.0, 0.0)
     K = 1.0 + (poses - freedom) / poses * unequal

@@ -17,7 +17,7 @@ from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.attitudes import Geometry, distinct
 from accelcal_cli.calibration.covariance import plain_spread
 from accelcal_cli.calibration.fit import Fit, uncalibrated
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability, unit
 from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL, PoseResiduals, room_of
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
@@ -163,8 +163,7 @@ def _noise(K: Float, left: Float, w: Float, free: int) -> tuple[Float, float, Fl
 
 def _attitudes(f: Float, sample: Sample) -> Int:
     """Return how many distinct attitudes the specific force has, m/s^2, shape (J, 3): shape (1,)."""
-    u = f / np.linalg.norm(f, axis=1, keepdims=True)
-    return distinct(u[None], np.ones((1, len(u)), dtype=bool), sample.labelled)[0]
+    return distinct(unit(f)[None], np.ones((1, len(f)), dtype=bool), sample.labelled)[0]
 
 
 def _two_of_nine(K: Float, low: Float, cofactor: Float, axes: Float) -> tuple[Float, Float]:
@@ -216,9 +215,9 @@ def covariance_of_twelve(result: Calibration) -> Float:
     chain = _chain(K, to_gauge(K, "lower"))
     entries = [(i, j) for i in range(4) for j in range(i + 1)]
     units = [np.zeros((4, 4)) for _ in entries]
-    for unit, (i, j) in zip(units, entries, strict=True):
-        unit[i, j] = unit[j, i] = 1.0
-    parts = np.stack([(chain @ np.kron(B, unit) @ chain.T).ravel() for unit in units], axis=1)
+    for part, (i, j) in zip(units, entries, strict=True):
+        part[i, j] = part[j, i] = 1.0
+    parts = np.stack([(chain @ np.kron(B, part) @ chain.T).ravel() for part in units], axis=1)
     sizes = np.linalg.lstsq(parts, result.covariance.ravel())[0]
     return np.asarray(np.kron(B, np.tensordot(sizes, units, axes=1)), dtype=float)
 

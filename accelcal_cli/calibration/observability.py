@@ -194,10 +194,14 @@ def moved_sensor(K: Float, D: Float, step: Float, g: float) -> tuple[Float, Floa
     return K @ np.linalg.inv(np.eye(3) + E), D + np.einsum("rii->ri", K) * step[:, BIAS]
 
 
+def unit(force: Float) -> Float:
+    """Return the unit directions of specific force, both shape (..., 3); 0 for none."""
+    return np.asarray(force / np.maximum(np.linalg.norm(force, axis=-1, keepdims=True), 1e-300))
+
+
 def directions_of(output: Float, model: ErrorModel) -> Float:
     """Return the unit directions of the specific force of outputs, both shape (J, 3)."""
-    force = model.specific_force(output)
-    return np.asarray(force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300))
+    return unit(model.specific_force(output))
 
 
 def attitudes(u: Float, n: NDArray[np.int64], angle: float) -> list[Int]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_chance
-from accelcal_cli.calibration.observability import ROWS_COLUMNS, design
+from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
 from accelcal_cli.calibration.sample import NO_NOISE, Sample
 
 KEPT = 1000
@@ -137,7 +137,7 @@ def _tell_rejected(
         studentised, left_out: to fill in, shape (R, k).
     """
     f, error, cofactor, total, freedom = fit
-    rows = design(f / np.maximum(np.linalg.norm(f, axis=2, keepdims=True), 1e-300))
+    rows = design(unit(f))
     spread = 1.0 + np.sum((rows @ cofactor) * rows, axis=2)
     deviation = np.sqrt(total[:, None] / np.maximum(freedom, 1) * spread)
     out = np.take_along_axis(rejected, number, axis=1)
@@ -208,8 +208,7 @@ def pattern_chance(residuals: PoseResiduals, w: Float, columns: Float, g: float)
         residuals: of all poses; w: their weights, shape (R, J); columns: of the pattern, shape (R, J, q); g: m/s^2.
     """
     f = residuals.force
-    length = np.linalg.norm(f, axis=2, keepdims=True)
-    rows = np.concatenate([design(f / np.where(length > 0, length, 1.0)), columns], axis=2)
+    rows = np.concatenate([design(unit(f)), columns], axis=2)
     e = (g * g - np.sum(f * f, axis=2)) / (2.0 * g)
     normal = (rows * w[..., None]).swapaxes(1, 2) @ rows
     values, vectors = np.linalg.eigh(normal)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.consensus import consensus
 from accelcal_cli.calibration.problem import Loetters, opened
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import NO_NOISE, Sample
@@ -22,7 +21,6 @@ from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.calibration.triangle import compress
 from accelcal_cli.calibration.weights import (
     MOST_TREMOR,
-    SURELY_TREMBLES,
     PoseNoise,
     Tremor,
     directions,
@@ -80,6 +78,17 @@ class Stated:
             weights = np.where(self.rejected, 0.0, 1.0 if weights is None else weights)
         cost, sources = opened(self.sample, self.settings, weights)
         return replace(self, weights=weights, cost=cost, sources=sources)
+
+    def each_weight(self) -> Float:
+        """Return the weight of each pose, 1 where all count alike and 0 for repetitions, shape (R, J)."""
+        if self.weights is not None:
+            return self.weights
+        return self.sample.real(0, int(self.sample.poses.max())).astype(float)
+
+    def counted(self) -> Int:
+        """Return how many poses are not left out, shape (R,)."""
+        rejected = 0 if self.rejected is None else self.rejected.sum(axis=1)
+        return np.asarray(self.sample.poses - rejected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +202,10 @@ def state(sample: Sample, settings: Settings) -> Stated:
 
 def agreed(stated: Stated) -> Stated:
     """Return the problem of one sensor without the poses that disagree with the others, weighted as is asked for."""
-    agreement = consensus(stated.sample, stated.settings)
-    rejected = None if agreement is None or agreement.agreeing.all() else ~agreement.agreeing[None]
+    from accelcal_cli.calibration.consensus import consensus
+
+    agreeing = consensus(stated.sample, stated.settings)
+    rejected = None if agreeing is None or agreeing.all() else ~agreeing[None]
     return replace(stated, rejected=rejected).with_weights(own_weights(stated))
 
 
@@ -220,9 +231,9 @@ def _with_noise(stated: Stated) -> Stated:
         # Directions by a sphere, where the poses fix no ellipsoid, do not tell along from across.
         poor = np.array([source == "sphere" for source in stated.sources]) | (trembling.angle > MOST_TREMOR)
         trembling = replace(trembling, certainty=np.where(poor, 0.0, trembling.certainty))
-    if trembling is not None and (trembling.certainty > SURELY_TREMBLES).any():
-        shakes = (trembling.certainty > SURELY_TREMBLES)[:, None]
-        longer = directions(sample, K, D) * np.where(shakes, trembling.excess / g, 0.0)[..., None]
+    if trembling is not None and trembling.sure.any():
+        given = np.where(trembling.sure[:, None], trembling.excess / g, 0.0)
+        longer = directions(sample, K, D) * given[..., None]
         sample = sample.with_output(sample.output() + longer @ K.swapaxes(1, 2))
         cost, sources = opened(sample, stated.settings, stated.weights)
         stated = replace(stated, sample=sample, tremor=trembling, cost=cost, sources=sources)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.calibration.observability import unit
 from accelcal_cli.calibration.sample import Sample
 
 FEWEST_ALIKE = 4
@@ -69,13 +70,12 @@ def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None)
     """
     if sample.scatter is None or sample.count is None:
         return None
-    S, own, real = _covariances(sample, K)
+    (S, own), real = _covariances(sample, K), sample.real(0, sample.scatter.shape[1])
     u = directions(sample, K, D)
     if shakes is not None:
         # Noise alike in all directions is left, and where the axes alone are known not even that is certain.
         along = np.einsum("rja,rjab,rjb->rj", u, S, u)
-        trembles = (shakes.certainty > SURELY_TREMBLES)[:, None, None, None]
-        S = np.where(trembles, along[..., None, None] * np.eye(3), S)
+        S = np.where(shakes.sure[:, None, None, None], along[..., None, None] * np.eye(3), S)
     total = np.maximum(own.sum(axis=1), 1.0)
     pooled = np.einsum("rj,rjab->rab", own, S) / total[:, None, None]
     along, expected = np.einsum("rja,rjab,rjb->rj", u, S, u), np.einsum("rja,rab,rjb->rj", u, pooled, u)
@@ -87,39 +87,42 @@ def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None)
     scale = np.where(real, weight / count, 0.0)
     known: Bool = np.asarray((np.isfinite(sample.count) | ~real).all(axis=1) & (own.sum(axis=1) > 0))
     if shakes is not None:
-        known &= (entries_of(sample)[:, 0, 0, 1] > 0) | (shakes.certainty <= SURELY_TREMBLES)
+        known &= _crossed(sample) | ~shakes.sure
     return PoseNoise(expected * scale, pooled[:, None] * scale[..., None, None], own, prior[:, 0], known)
 
 
-def _covariances(sample: Sample, K: Float) -> tuple[Float, Float, Bool]:
-    """Return the covariance of one reading of each pose as force, its degrees of freedom, and which poses are real."""
-    assert sample.scatter is not None
-    assert sample.count is not None
-    real = sample.real(0, sample.scatter.shape[1])
-    told = real & np.isfinite(sample.scatter).all(axis=2) & np.isfinite(sample.count)
-    scatter = np.where(told[..., None], sample.scatter, 0.0)
+def _covariances(sample: Sample, K: Float) -> tuple[Float, Float]:
+    """Return the covariance of one reading of each pose as force, shape (R, J, 3, 3), and its degrees of freedom."""
+    scatter, own = _scatter(sample)
     S = np.zeros((*scatter.shape, 3))
     S[..., [0, 1, 2], [0, 1, 2]] = scatter**2
     if sample.cross is not None:
-        cross = np.where(told[..., None], np.nan_to_num(sample.cross), 0.0)
+        cross = np.where((own > 0)[..., None], np.nan_to_num(sample.cross), 0.0)
         S[..., [0, 0, 1], [1, 2, 2]] = S[..., [1, 2, 2], [0, 0, 1]] = cross
     K_A = np.linalg.inv(K)[:, None]
+    return K_A @ S @ K_A.swapaxes(2, 3), own
+
+
+def _scatter(sample: Sample) -> tuple[Float, Float]:
+    """Return standard deviations of one reading, 0 where not known, and their degrees of freedom, (R, J, 3), (R, J)."""
+    assert sample.scatter is not None
+    assert sample.count is not None
+    told = sample.real(0, sample.scatter.shape[1]) & np.isfinite(sample.scatter).all(axis=2)
     own = np.where(told, np.maximum(np.nan_to_num(sample.count) - 1.0, 0.0), 0.0)
-    return K_A @ S @ K_A.swapaxes(2, 3), own, real
+    return np.where((own > 0)[..., None], sample.scatter, 0.0), own
 
 
-def entries_of(sample: Sample) -> Float:
-    """Return which entries of the covariances of the poses are known, 0 or 1, shape (R, 1, 3, 3)."""
-    known: Bool = np.zeros(len(sample), dtype=bool)
-    if sample.cross is not None:
-        known = np.asarray(~np.isnan(sample.cross).all(axis=(1, 2)))
-    return np.where(known[:, None, None, None], np.ones((3, 3)), np.eye(3))
+def _crossed(sample: Sample) -> Bool:
+    """Return which sensors have covariances between the axes, and not their standard deviations alone, shape (R,)."""
+    if sample.cross is None:
+        return np.zeros(len(sample), dtype=bool)
+    return np.asarray(~np.isnan(sample.cross).all(axis=(1, 2)))
 
 
 def directions(sample: Sample, K: Float, D: Float) -> Float:
     """Return the unit directions of the specific force, shape (R, J, 3), by sensors K and D."""
     f = (sample.output() - D[:, None]) @ np.linalg.inv(K).swapaxes(1, 2)
-    return np.asarray(f / np.maximum(np.linalg.norm(f, axis=2, keepdims=True), 1e-300))
+    return unit(f)
 
 
 def _prior(ratio: Float, own: Float) -> tuple[Float, Float]:
@@ -176,11 +179,9 @@ def alike_weights(sample: Sample) -> Float:
 
     Each axis is measured by its own variance over all poses, so that a noisy axis does not decide.
     """
-    assert sample.scatter is not None
     assert sample.count is not None
-    told = np.asarray(np.isfinite(sample.scatter).all(axis=2))
-    own = np.where(told, np.maximum(np.nan_to_num(sample.count) - 1.0, 0.0), 0.0)
-    square = np.where(told[..., None], sample.scatter, 0.0) ** 2
+    scatter, own = _scatter(sample)
+    square = scatter**2
     pooled = np.einsum("rj,rja->ra", own, square) / np.maximum(own.sum(axis=1), 1.0)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(own > 0, np.nanmean(square / pooled[:, None], axis=2), 1.0)
@@ -204,6 +205,11 @@ class Tremor:
     certainty: Float
     doubt: Float
 
+    @property
+    def sure(self) -> Bool:
+        """Which sensors tremble beyond chance, shape (R,)."""
+        return np.asarray(self.certainty > SURELY_TREMBLES)
+
 
 def tremor(sample: Sample, K: Float, D: Float, g: float) -> Tremor | None:
     """Return what trembling takes off the poses of sensors K, D; None where no reading tells.
@@ -214,10 +220,10 @@ def tremor(sample: Sample, K: Float, D: Float, g: float) -> Tremor | None:
     """
     if sample.scatter is None or sample.count is None:
         return None
-    S, own, _ = _covariances(sample, K)
-    u = directions(sample, K, D)
+    S, own = _covariances(sample, K)
+    u, whole = directions(sample, K, D), _crossed(sample)
     across = np.eye(3) - u[..., :, None] * u[..., None, :]
-    entries = entries_of(sample)
+    entries = np.where(whole[:, None, None, None], np.ones((3, 3)), np.eye(3))
     total = np.maximum(own.sum(axis=1), 1.0)
     middle_S = np.einsum("rj,rjab->rab", own, S) / total[:, None, None]
     middle = np.einsum("rj,rjab->rab", own, across) / total[:, None, None]
@@ -230,14 +236,12 @@ def tremor(sample: Sample, K: Float, D: Float, g: float) -> Tremor | None:
         certainty = np.where(size > 0, tau * np.sqrt(square) / (np.sqrt(2.0) * size), 0.0)
     trace, along = np.einsum("rjaa->rj", S), np.einsum("rja,rjab,rjb->rj", u, S, u)
     sensor = np.einsum("raa->r", middle_S) - tau * np.einsum("raa->r", middle)
-    whole = entries[:, 0, 0, 1] > 0
     excess = np.where(whole[:, None], 0.5 * (trace - along) - along, 0.5 * (trace - sensor[:, None]))
     # Along the force a tilt adds to the variance in the second order, of a Gaussian tremor by excess^2 / g^2.
     second = np.where(own > 0, excess, 0.0) ** 2 / (g * g)
     excess = np.where(whole[:, None], excess + 1.5 * second, excess)
-    excess = np.where(
-        own > 0, excess * own / (own + 1.0), 0.0
-    )  # of these readings, not of all that might have been
+    # Of these readings, not of all that might have been.
+    excess = np.where(own > 0, excess * own / (own + 1.0), 0.0)
     angle = np.sqrt(np.maximum(tau, 0.0)) / g
     with np.errstate(divide="ignore", invalid="ignore"):
         doubt = np.where(whole | (square <= 0), 0.0, np.sqrt(2.0) * size / np.sqrt(square) / g)

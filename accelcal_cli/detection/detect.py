@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
+from accelcal_cli.calibration.attitudes import APART
 from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.observability import Observability, attitudes, directions_of
 from accelcal_cli.calibration.sample import Sample
@@ -39,9 +40,6 @@ from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
 """Tried when none is stated; [tedaldi2014] tries 2 to 10 times the variance of a marked still period."""
 
-DISTINCT = 5.0
-"""Degrees between attitudes that count as two."""
-
 TIE = 1.05
 """Sigmas up to this factor apart are the same: the smallest multiplier, the stillest poses, then decides."""
 
@@ -61,7 +59,7 @@ class DetectSettings:
         rate: rows per second, Hz; that of the time column when None.
         multipliers: of the still level; the best one is kept.
         merge: poses within this angle become one, degrees; thin: only the longest of them stays, degrees.
-        least_poses: attitudes that must be found, DISTINCT degrees apart.
+        least_poses: attitudes that must be found, APART degrees apart.
         g: local gravity, m/s^2.
     """
 
@@ -245,7 +243,7 @@ def evaluate(segmentation: Segmentation, g: float) -> CandidateThreshold:
     if poses < 2 or not np.ptp(intervals.mean, axis=0).any():
         return CandidateThreshold(multiplier, poses, min(poses, 1))
     model, rms, worst, verdict = screen(readings_of(intervals, "log"), g)
-    distinct = len(attitudes(directions_of(intervals.mean, model), intervals.n, DISTINCT))
+    distinct = len(attitudes(directions_of(intervals.mean, model), intervals.n, APART))
     sigma = worst * math.sqrt(poses / distinct)
     return CandidateThreshold(
         multiplier, poses, distinct, rms, sigma if math.isfinite(sigma) else math.inf, verdict

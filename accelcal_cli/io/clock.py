@@ -175,11 +175,6 @@ def is_counted(cell: str) -> bool:
     return cell.isascii() and cell.isdigit() and len(cell) >= COUNTED
 
 
-def is_stamp(cell: str) -> bool:
-    """Return whether a cell is a date, a clock or both."""
-    return _ISO.fullmatch(cell) is not None or _parse(cell) is not None
-
-
 def seconds_of_dates(
     rows: Iterable[RowBlock], place: Callable[[int], str], day_first: bool | None = None
 ) -> Iterator[RowBlock]:

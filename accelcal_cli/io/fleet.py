@@ -330,11 +330,10 @@ class _FleetCollector:
             columns.check(table, rows)
             labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
             codes = number_labels(self.index, labels)
-            keep = None if columns.reference is not None else zeros.keep(rows.numbers[:, :3], rows.start)
             numbers, label = rows.numbers, rows.texts[columns.sensor is not None] if means is not None else ()
+            keep = None if columns.reference is not None else zeros.keep(numbers[:, :3], rows.start)
             if keep is not None:
-                for row in np.flatnonzero(~keep).tolist():
-                    idle.setdefault(int(codes[row]), []).append(rows.start + row)
+                _set_aside(idle, codes, keep, rows.start)
                 codes, numbers, label = codes[keep], numbers[keep], list(compress(label, keep.tolist()))
             output, (count, scatter, _) = numbers[:, :3], columns.split(numbers[:, 3:])
             if means is None:
@@ -393,6 +392,12 @@ class _FleetCollector:
         for part, values in zip(EXTRAS, (behind, scatter, cross), strict=True):
             rows[:, part] = np.nan if values is None else values
         self.extras.append(rows)
+
+
+def _set_aside(idle: dict[int, list[int]], codes: Int, keep: Bool, start: int) -> None:
+    """Add the rows that are not kept, from `start` on, to those of their sensors, by its number."""
+    for row in np.flatnonzero(~keep).tolist():
+        idle.setdefault(int(codes[row]), []).append(start + row)
 
 
 def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> list[str]:

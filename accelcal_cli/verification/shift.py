@@ -222,18 +222,13 @@ class _View:
         """Directions of the force, shape (1, J, 3); of readings that are held in memory."""
         return directions(self.stated.sample, self.model.K[None], self.model.D[None])
 
-    def weights(self) -> Float:
-        """The weights of the poses, shape (1, J)."""
-        one, weights = np.ones((1, int(self.stated.sample.poses[0]))), self.stated.weights
-        return one if weights is None else weights
-
     def spread(self, variance: float, freedom: int) -> NoiseSpread:
         """Return noise and covariance of a linear step that leaves so much variance of weight 1."""
         spread = plain_spread(np.array([variance]), self.cofactor[None], np.array([freedom]))
         if self.stated.noise is None or freedom < 1:
             return spread
         rows, noise, count = design(self.u), self.stated.noise, np.array([freedom])
-        return scattered_spread(spread, rows, self.weights(), self.cofactor[None], noise, count)
+        return scattered_spread(spread, rows, self.stated.each_weight(), self.cofactor[None], noise, count)
 
     def shift(self, spread: NoiseSpread, value: Float, felt: Float | None, known: Bool, step: Float) -> Shift:
         """Return the shift with the noise that the new readings show, or else that of the result."""
@@ -272,7 +267,7 @@ class _View:
         ratio = 1.0 if old.residual_noise_ratio is None else min(old.residual_noise_ratio, 1.0)
         part = ratio**2 if old.shared_noise == 0 else 1.0
         own: Float = old.shared_noise**2 + part * noise.variance
-        w, rows = self.weights(), design(self.u)
+        w, rows = self.stated.each_weight(), design(self.u)
         room = 1.0 - leverages(rows, w, self.cofactor[None])
         if _counted(self.stated) <= self.basis.shape[1]:
             room = np.ones_like(w)
@@ -281,7 +276,7 @@ class _View:
 
     def _moved_by(self, felt: Float) -> Float:
         """Return what errors of the slopes do to the estimate, shape (9, 6)."""
-        A, w = design(self.u)[0], self.weights()[0]
+        A, w = design(self.u)[0], self.stated.each_weight()[0]
         return np.asarray(self.cofactor @ (A * w[:, None]).T @ felt)
 
 

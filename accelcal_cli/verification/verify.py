@@ -21,7 +21,7 @@ from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration import distributions
 from accelcal_cli.calibration.assess import is_large, large_residuals, not_fitting, ratio_in_words
 from accelcal_cli.calibration.distributions import Noise, Pair
-from accelcal_cli.calibration.observability import PARAMETERS, design
+from accelcal_cli.calibration.observability import PARAMETERS, design, unit
 from accelcal_cli.calibration.residuals import beyond_chance, length_error, leverages, room_of, studentise
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
@@ -425,4 +425,4 @@ def _outliers_of_result(old: Calibration, shift: Shift) -> Bool:
 
 def _rows(f: Float) -> Float:
     """Return the design of poses by the directions of their force, shape (B, 9)."""
-    return design(f / np.linalg.norm(f, axis=1, keepdims=True))
+    return design(unit(f))

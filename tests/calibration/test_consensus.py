@@ -27,7 +27,7 @@ def spoilt(at, factor, seed=1, count=24):
 def agreeing(data):
     found = consensus(Sample.of([data]), FAST)
     assert found is not None
-    return found.agreeing
+    return found
 
 
 @pytest.mark.parametrize("factor", [0.05, 1.1, 1.3, 1.6, 2.0, 10.0])
