@@ -21,9 +21,8 @@ from accelcal_cli.calibration.observability import (
     SCALE,
     PoseVerdict,
     poses_to_add,
-    unit,
 )
-from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, pattern_chance
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, bend_and_drift
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
@@ -252,20 +251,12 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
 
 
 def _patterns(fit: Fit) -> tuple[Float, Float]:
-    """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
-
-    A quadratic and a cubic term of each axis; a bias that changes evenly from the first pose to the last.
-    """
+    """Return the p-values of `bend_and_drift`, NaN where slopes are fitted or not all residuals are kept."""
     residuals, sample = fit.residuals, fit.sample
     poses = int(sample.poses.max())
     if fit.solution is None or residuals.pose.shape[1] < poses or fit.solution.slopes is not None:
         return np.full(len(sample), np.nan), np.full(len(sample), np.nan)
-    weights = fit.solution.robust_weights()
-    w = residuals.real.astype(float) if weights is None else weights
-    u = unit(residuals.force)
-    time = (residuals.pose / np.maximum(sample.poses[:, None] - 1, 1))[..., None]
-    bent = pattern_chance(residuals, w, np.concatenate([u**3, u**4], axis=2), fit.settings.g)
-    return bent, pattern_chance(residuals, w, time * u, fit.settings.g)
+    return bend_and_drift(residuals, sample.poses, fit.settings.g)
 
 
 def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:
