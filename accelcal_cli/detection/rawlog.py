@@ -18,9 +18,9 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.clock import UNITS, Clock, seconds_of_dates, unit_of
 from accelcal_cli.io.columns import RawColumns, choose_raw, restrict
-from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm
-from accelcal_cli.io.rows import OneSensor, ZeroRows
+from accelcal_cli.io.rows import OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.vocabulary import parse_unit
 
 PROBE = 1000

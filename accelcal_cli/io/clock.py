@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import COUNTED, GUESSED
-from accelcal_cli.io.reader import RowBlock, shorten
+from accelcal_cli.io.reader import shorten
+from accelcal_cli.io.rows import RowBlock
 from accelcal_cli.io.vocabulary import parse_unit
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}

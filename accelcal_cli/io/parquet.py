@@ -13,11 +13,11 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.preamble import Facts
-from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
+from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
-from accelcal_cli.io.rows import RowFilter
+from accelcal_cli.io.rows import RowBlock, RowFilter
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
+from accelcal_cli.io.vocabulary import Facts
 
 ROWS = 500_000
 """Rows of a block."""

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import (
     BOM,
@@ -31,14 +30,12 @@ from accelcal_cli.io.dialect import (
     split_cells,
     understand,
 )
-from accelcal_cli.io.preamble import Facts
-from accelcal_cli.io.skipped import LineMap, PassedLines
+from accelcal_cli.io.rows import LineMap, PassedLines, RowBlock, RowFilter
 from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
+from accelcal_cli.io.vocabulary import Facts
 
 if TYPE_CHECKING:
     import polars as pl
-
-    from accelcal_cli.io.rows import RowFilter
 
 LIMIT = 1e100
 """Largest reading: greater values cannot be squared safely."""
@@ -85,18 +82,6 @@ class Selection:
     texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
     needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
     carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
-
-
-@dataclass(frozen=True, eq=False)
-class RowBlock:
-    """Rows of a table: `numbers` (B, k) and `texts`, each of length B, in the order of the selection.
-
-    `start` is the number of the first row in the table, from 0.
-    """
-
-    start: int
-    numbers: Float
-    texts: tuple[Sequence[str], ...] = ()
 
 
 class InputTable(Protocol):
