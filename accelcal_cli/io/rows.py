@@ -32,6 +32,12 @@ if TYPE_CHECKING:
 
     from accelcal_cli.io.reader import InputTable
 
+MOST_BAD = 0.05
+"""Part of the rows that --skip-bad leaves out at most."""
+
+SKIPPABLE = "; --skip-bad leaves out broken rows"
+"""What ends the refusal of a row that is one of few broken ones."""
+
 NAMED = 8
 """Lines that a note names at most."""
 
@@ -62,6 +68,16 @@ class RowBlock:
     start: int
     numbers: Float
     texts: tuple[Sequence[str], ...] = ()
+
+    def only(self, keep: Bool) -> RowBlock:
+        """Return the rows that `keep`, shape (B,), marks, numbered as before."""
+        texts = tuple(list(compress(text, keep.tolist())) for text in self.texts)
+        return RowBlock(self.start, self.numbers[keep], texts)
+
+    def joined(self, other: RowBlock) -> RowBlock:
+        """Return these rows and those of another block after them."""
+        texts = tuple([*text, *more] for text, more in zip(self.texts, other.texts, strict=True))
+        return RowBlock(self.start, np.concatenate([self.numbers, other.numbers]), texts)
 
 
 @dataclass
@@ -134,7 +150,7 @@ class PassedLines:
 
     def named(self, numbers: Sequence[int]) -> str:
         """Return how a message names lines of the input: ``lines 5, 9 and 3 more``."""
-        shown = ", ".join(str(self._line(number)) for number in numbers[:NAMED])
+        shown = ", ".join(str(self._line(number)) for number in sorted(numbers)[:NAMED])
         more = f" and {len(numbers) - NAMED:,} more" if len(numbers) > NAMED else ""
         return f"line{'s' * (len(numbers) != 1)} {shown}{more}"
 
@@ -313,10 +329,7 @@ class ZeroRows:
     def without(self, rows: RowBlock) -> RowBlock:
         """Return a block, whose first three numbers are the output, without such rows."""
         keep = self.keep(rows.numbers[:, :3], rows.start)
-        if keep is None:
-            return rows
-        texts = tuple(list(compress(text, keep.tolist())) for text in rows.texts)
-        return RowBlock(rows.start, rows.numbers[keep], texts)
+        return rows if keep is None else rows.only(keep)
 
     def keep(self, output: Float, start: int) -> Bool | None:
         """Return which rows stay, shape (B,), or None for all; output (B, 3), `start` the number of the first."""

@@ -179,7 +179,7 @@ def read(text: str, **options: object) -> Readings:
 def test_broken_rows_are_left_out_on_request() -> None:
     many = "ax,ay,az\n" + BODY * 4
     broken = many.replace("\n", "\n1,2-3,4\n", 1)
-    with pytest.raises(DataError, match='line 2, column "ay": "2-3" is not a number'):
+    with pytest.raises(DataError, match='line 2, column "ay": "2-3" is not a number; --skip-bad leaves out'):
         read(broken)
     readings = read(broken, skip_bad=True)
     assert "1 broken row left out (--skip-bad): line 2" in readings.notes
@@ -202,3 +202,23 @@ def test_a_repeated_header_and_rows_of_other_sensors_are_no_readings() -> None:
     assert any("header is repeated" in note for note in again.notes)
     merged = "ax,ay,az,alt\n" + "".join(f"{x},{y},{z},\n,,,12\n" for x, y, z in ROWS)
     np.testing.assert_array_equal(read(merged).output(), ROWS)
+
+
+@pytest.mark.parametrize(
+    ("line", "seen"),
+    [
+        ("nan,1,2", "is not a finite number"),
+        ("1,2", "has 2 cells"),
+        ("1,,3", "is empty"),
+        ('1,"2,3', "quotation mark"),
+    ],
+)
+def test_a_refusal_names_the_option_that_helps(line: str, seen: str) -> None:
+    lines = BODY * 40
+    with pytest.raises(DataError, match=f"line 5[,:].*{seen}.*; --skip-bad leaves out broken rows$"):
+        read("ax,ay,az\n" + lines.replace("\n", f"\n{line}\n", 3).replace(f"{line}\n", "", 2))
+    with pytest.raises(
+        DataError, match=f"line 2[,:].*{seen}"
+    ) as told:  # every third row: the option would not help
+        read("ax,ay,az\n" + f"{line}\n1,2,3\n3,2,1\n" * 30)
+    assert "--skip-bad" not in str(told.value)
