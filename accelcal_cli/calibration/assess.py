@@ -22,7 +22,7 @@ from accelcal_cli.calibration.observability import (
     PoseVerdict,
     poses_to_add,
 )
-from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, bend_and_drift
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
@@ -134,7 +134,7 @@ def assess(fit: Fit) -> Assessment:
             suggestions[at], reasons[at] = _advice(fit, at, unchecked[at])
     outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
-    left, (bent, drift) = _to_gain(fit), _patterns(fit)
+    left, (bent, drift) = _to_gain(fit), fit.patterns
     patterned = (bent < SURELY_PATTERN) | (drift < SURELY_PATTERN)
     for at in np.flatnonzero(_may_have_warnings(fit, left) | patterned).tolist():
         own = _patterns_in_words(float(bent[at]), float(drift[at]))
@@ -200,7 +200,7 @@ def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[
     if not known and attitudes < poses and view.verdict != "good":
         lines.insert(0, f"The {poses:,} poses have {attitudes} different attitudes, and those decide.")
     if unchecked.any():
-        which = [fit.sample.readings(at).where(pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
+        which = [fit.sample.where(at, pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
         lines.append(
             f"No other pose checks {_listed(which)}: an error there would not show. Take at least {FEWEST_POSES + 1}."
         )
@@ -248,15 +248,6 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     always |= settings.nominal is not None
     always |= fit.solution is not None and fit.solution.stated.tremor is not None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
-
-
-def _patterns(fit: Fit) -> tuple[Float, Float]:
-    """Return the p-values of `bend_and_drift`, NaN where slopes are fitted or not all residuals are kept."""
-    residuals, sample = fit.residuals, fit.sample
-    poses = int(sample.poses.max())
-    if fit.solution is None or residuals.pose.shape[1] < poses or fit.solution.slopes is not None:
-        return np.full(len(sample), np.nan), np.full(len(sample), np.nan)
-    return bend_and_drift(residuals, sample.poses, fit.settings.g)
 
 
 def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:

@@ -35,7 +35,7 @@ from accelcal_cli.calibration.observability import (
     propagate,
     unit,
 )
-from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, pose_residuals, worst
+from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, bend_and_drift, pose_residuals, worst
 from accelcal_cli.calibration.result import PoseFit, Temperature
 from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error, loss_slope, loss_weight
 from accelcal_cli.calibration.search import SLOPES, Search, Solution, state, unsearched
@@ -75,7 +75,8 @@ class Fit:
         at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
-        residuals: pose by pose.
+        residuals: pose by pose; patterns: p-values of residuals that bend with the direction, and that drift from pose
+            to pose, shape (R,) each, NaN where slopes are fitted or not all residuals are kept.
         solution: what was fitted; None with known attitudes.
         notes: of the solution, in sentences.
     """
@@ -105,6 +106,7 @@ class Fit:
     before: list[str]
     nominal: Float
     residuals: PoseResiduals
+    patterns: tuple[Float, Float]
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
 
@@ -143,14 +145,14 @@ class Fit:
 
     def pose_fits(self, at: int) -> tuple[PoseFit, ...]:
         """Return the kept residuals of the sensor number `at`, pose by pose, with the directions they are seen in."""
-        readings, residuals, (K, D) = self.sample.readings(at), self.residuals, self.sight
+        sample, residuals, (K, D) = self.sample, self.residuals, self.sight
         real = residuals.real[at]
         output = ErrorModel(self.lower[at], self.D[at]).output(residuals.force[at, real])
         directions = unit(ErrorModel(K[at], D[at]).specific_force(output)).tolist()
         return tuple(
             PoseFit(
                 pose=int(pose),
-                where=readings.where(int(pose)),
+                where=sample.where(at, int(pose)),
                 residual=float(residuals.error[at, k]),
                 studentised=float(residuals.studentised[at, k]),
                 leverage=float(residuals.leverage[at, k]),
@@ -226,6 +228,7 @@ def fit(solution: Solution) -> Fit:
         before=before,
         nominal=nominal,
         residuals=residuals,
+        patterns=_patterns(solution, residuals, g),
         solution=solution,
         notes=solution.notes,
     )
@@ -266,6 +269,14 @@ def quick_fit(readings: Readings, settings: Settings) -> QuickFit:
     rms = np.sqrt(np.mean(np.concatenate(parts) ** 2))
     verdict = "undetermined" if _at_wall(solution.x).any() else geometry.verdict
     return QuickFit(ErrorModel(point.lower[0], point.D[0]), float(rms), float(s * geometry.worst), verdict)
+
+
+def _patterns(solution: Solution, residuals: PoseResiduals, g: float) -> tuple[Float, Float]:
+    """Return the p-values of patterns in the residuals, as of `Fit`."""
+    poses = solution.sample.poses
+    if solution.slopes is not None or residuals.pose.shape[1] < int(poses.max()):
+        return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
+    return bend_and_drift(residuals, poses, g)
 
 
 def _point(solution: Solution, held: Bool | None) -> _Point:

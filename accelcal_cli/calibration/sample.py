@@ -141,6 +141,10 @@ class Sample:
         """R, the number of sensors."""
         return len(self.poses)
 
+    def where(self, at: int, pose: int) -> str:
+        """Return how to name a pose of the sensor number `at`: by its label or its line."""
+        return self.readings(at).where(pose)
+
     def real(self, first: int, width: int) -> Bool:
         """Return which of the poses from `first` on are no repetitions, shape (R, width)."""
         return np.asarray(np.arange(first, first + width) < self.poses[:, None])
