@@ -335,7 +335,7 @@ class CarefulParser:
                 text.append(label)
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
-        return RowBlock(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+        return RowBlock(start, numbers.reshape(self.row - start, len(self.selection.numbers)), texts)
 
     def _few_are_broken(self, lines: Iterable[bytes]) -> bool:
         """Return whether --skip-bad would leave out this row, going by the rows so far and the next lines."""
@@ -493,7 +493,7 @@ class FastParser:
         numbers = np.array(
             [column.to_numpy() for column in series]
         ).T  # column after column: faster to reduce
-        if not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
+        if series and not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
             return None
         texts = tuple(frame[str(k)].str.strip_chars().fill_null("").to_list() for k in selection.texts)
         whole = all(k in selection.gaps or all(text) for k, text in zip(selection.texts, texts, strict=True))
