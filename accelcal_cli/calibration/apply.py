@@ -161,7 +161,8 @@ def prepare(
     warm = () if result.temperature is None or columns.temperature is None else (columns.temperature,)
     places = columns.output if options.replace else ()
     formula = Correction(result, options)
-    change = Change(Selection((*columns.output, *warm)), formula, options.names, places)
+    selection = Selection((*columns.output, *warm), carried=frozenset(warm))
+    change = Change(selection, formula, options.names, places)
     return Log(table, change, formula, _notes(columns, result, used=bool(warm)))
 
 

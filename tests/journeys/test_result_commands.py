@@ -212,6 +212,30 @@ def test_text_becomes_parquet(run, result, log):
     assert "line 11" in run("apply", result, "bad.csv", *options, "-o", "bad.csv").err
 
 
+def test_a_slower_temperature_is_carried_on(run, tmp_path):
+    """An empty cell has the last temperature above it; before the first there is none to take."""
+    assert run("simulate", "--sensor", "mems", "--positions", "24", "-o", "u.csv", "-q").code == 0
+    degrees = np.tile([10.0, 40.0], 24)
+    rows = np.repeat(np.loadtxt("u.csv", delimiter=",", skiprows=1), 2, axis=0) + 0.5 * degrees[:, None]
+    cells = [",".join(map(repr, row)) for row in rows.tolist()]
+    header = "Nx,Ny,Nz,temperature\n"
+    full = [f"{row},{t}\n" for row, t in zip(cells, degrees.tolist(), strict=True)]
+    Path("warm.csv").write_text(header + "".join(full))
+    assert run("calibrate", "warm.csv", "--g", G, "-o", "warm.yaml", "-q").code == 0
+    Path("same.csv").write_text(
+        header + "".join(f"{row},{10.0 + 30.0 * (k // 4 % 2)}\n" for k, row in enumerate(cells))
+    )
+    slow = [f"{row},{10.0 + 30.0 * (k // 4 % 2) if k % 4 == 0 else ''}\n" for k, row in enumerate(cells)]
+    Path("slow.csv").write_text(header + "".join(slow))
+    force_of = {name: run("apply", "warm.yaml", name).out for name in ("same.csv", "slow.csv")}
+    same, sparse = (
+        np.genfromtxt(io.StringIO(text), delimiter=",", skip_header=1) for text in force_of.values()
+    )
+    np.testing.assert_array_equal(same[:, 4:], sparse[:, 4:])
+    Path("late.csv").write_text(header + "".join(slow[1:]))
+    assert 'line 2, column "temperature"' in run("apply", "warm.yaml", "late.csv").err
+
+
 def test_a_log_may_be_replaced_by_its_result(run, result, log):
     before = Path(log).read_text()
     assert run("apply", result, log, "-o", log, "-q").code == 0
