@@ -176,7 +176,7 @@ class _Logs:
     Attributes:
         columns, form, log, local_g: see `options.DetectionOptions.detect`.
         labels: of the sensors; readings: the static poses of each, or why there are none.
-        g: local gravity in the unit of the first log that has poses.
+        gravities: local gravity in the unit of each that has poses, by its number; g: in that of most of them.
         notes: what there is to say of logs, and of how many.
     """
 
@@ -186,6 +186,7 @@ class _Logs:
     local_g: Callable[[str | None], float]
     labels: list[str] = field(default_factory=list)
     readings: list[Readings | str] = field(default_factory=list)
+    gravities: dict[int, float] = field(default_factory=dict)
     g: float | None = None
     notes: Counter[str] = field(default_factory=Counter)
 
@@ -214,6 +215,7 @@ class _Logs:
                     faults.append(error)
         if len(faults) == len(self.labels) and all(isinstance(error, UsageError) for error in faults):
             raise faults[0]
+        self._leave_out_other_units()
 
     def told(self) -> list[str]:
         """Return the notes, each once with the number of its logs where there are several."""
@@ -247,20 +249,25 @@ class _Logs:
         ]
 
     def _add(self, label: str, source: str, found: Detection | AccelcalError) -> None:
-        """Add a sensor; one whose readings are in another unit than those before it cannot be compared with them."""
+        """Add a sensor: its poses, or why there are none."""
         self.labels.append(label)
         if isinstance(found, AccelcalError):
             self.readings.append(str(found).removeprefix(source).lstrip(":, ").rstrip("."))
             return
-        g = found.settings.g
-        if self.g not in (None, g):
-            self.readings.append(
-                f"the unit is another than that of the logs before it, where 1 g is {self.g:g}"
-            )
-            return
-        self.g = g
         self.readings.append(found.readings())
+        self.gravities[len(self.readings) - 1] = found.settings.g
         self.notes.update(found.notes)
+
+    def _leave_out_other_units(self) -> None:
+        """Leave out sensors whose readings are in another unit than those of most: they cannot be compared."""
+        if not self.gravities:
+            return
+        ((self.g, _),) = Counter(self.gravities.values()).most_common(1)
+        for at, own in self.gravities.items():
+            if own != self.g:
+                self.readings[at] = (
+                    f"1 g is {own:g} in the unit of its readings, and {self.g:g} in that of most logs"
+                )
 
 
 def _check_output(output: str) -> bool:

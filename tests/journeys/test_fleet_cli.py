@@ -308,19 +308,19 @@ def test_a_broken_or_poor_log_is_a_row_and_not_the_end(run, logs):
     in_g = [line.split(",") for line in lines[1:]]
     cells = [[row[0], *(f"{float(cell) / 16350:.6f}" for cell in row[1:])] for row in in_g]
     Path("in_g.csv").write_text("t,ax [g],ay [g],az [g]\n" + "".join(",".join(row) + "\n" for row in cells))
-    files = ("broken.csv", logs[0], "poor.csv", "gone.csv", logs[1], "in_g.csv")
+    files = ("in_g.csv", "broken.csv", logs[0], "poor.csv", "gone.csv", logs[1])
     done = run("fleet", "--raw", *files, "--format", "json")
     assert done.code == 1
     rows = {row["sensor"]: row for row in json.loads(done.out)}
     assert [(name, row["verdict"]) for name, row in rows.items()] == [
-        ("broken", "failed"), ("s1", "good"), ("poor", "failed"), ("gone", "failed"), ("s2", "good"),
-        ("in_g", "failed"),
+        ("in_g", "failed"), ("broken", "failed"), ("s1", "good"), ("poor", "failed"), ("gone", "failed"),
+        ("s2", "good"),
     ]  # fmt: skip
     assert rows["broken"]["reason"].startswith("Line 301: has 3 cells")
     assert "fewer than 12" in rows["poor"]["reason"]
     assert rows["gone"]["reason"].startswith("No such file")
-    assert "another" in rows["in_g"]["reason"]
-    assert "4 of 6 sensors undetermined or failed: broken, poor, gone, in_g" in done.err
+    assert rows["in_g"]["reason"].startswith("1 g is 1 in the unit of its readings, and 9.80665 in that")
+    assert "4 of 6 sensors undetermined or failed: in_g, broken, poor, gone" in done.err
     mended = run("fleet", "--raw", "broken.csv", logs[1], "--skip-bad", "--format", "json")
     assert [row["verdict"] for row in json.loads(mended.out)] == ["good", "good"]
     assert "1 broken row left out (--skip-bad): line 301 (1 of 2 logs)" in mended.err
