@@ -75,8 +75,7 @@ class Fit:
         at_wall: which unknowns of the search are at a wall of their box, shape (R, D).
         rms, rms_before: of |f| - g after and before, m/s^2, shape (R,); before: what the readings were taken for;
             nominal: scale factors before, shape (R, 3).
-        residuals: pose by pose; patterns: p-values of residuals that bend with the direction, and that drift from pose
-            to pose, shape (R,) each, NaN where slopes are fitted or not all residuals are kept.
+        residuals: pose by pose.
         solution: what was fitted; None with known attitudes.
         notes: of the solution, in sentences.
     """
@@ -106,7 +105,6 @@ class Fit:
     before: list[str]
     nominal: Float
     residuals: PoseResiduals
-    patterns: tuple[Float, Float]
     solution: Solution | None = None
     notes: tuple[str, ...] = ()
 
@@ -134,6 +132,18 @@ class Fit:
     def K_A(self) -> Float:  # noqa: N802
         """Inverse matrices, m/s^2 per output unit, shape (R, 3, 3)."""
         return np.linalg.inv(self.K)
+
+    @cached_property
+    def patterns(self) -> tuple[Float, Float]:
+        """P-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
+
+        NaN with known attitudes, where slopes are fitted, and where not all residuals are kept.
+        """
+        poses = self.sample.poses
+        every = self.residuals.pose.shape[1] >= int(poses.max())
+        if self.solution is None or self.solution.slopes is not None or not every:
+            return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
+        return bend_and_drift(self.residuals, poses, self.settings.g)
 
     @property
     def temperature(self) -> Temperature | None:
@@ -228,7 +238,6 @@ def fit(solution: Solution) -> Fit:
         before=before,
         nominal=nominal,
         residuals=residuals,
-        patterns=_patterns(solution, residuals, g),
         solution=solution,
         notes=solution.notes,
     )
@@ -269,14 +278,6 @@ def quick_fit(readings: Readings, settings: Settings) -> QuickFit:
     rms = np.sqrt(np.mean(np.concatenate(parts) ** 2))
     verdict = "undetermined" if _at_wall(solution.x).any() else geometry.verdict
     return QuickFit(ErrorModel(point.lower[0], point.D[0]), float(rms), float(s * geometry.worst), verdict)
-
-
-def _patterns(solution: Solution, residuals: PoseResiduals, g: float) -> tuple[Float, Float]:
-    """Return the p-values of patterns in the residuals, as of `Fit`."""
-    poses = solution.sample.poses
-    if solution.slopes is not None or residuals.pose.shape[1] < int(poses.max()):
-        return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
-    return bend_and_drift(residuals, poses, g)
 
 
 def _point(solution: Solution, held: Bool | None) -> _Point:

@@ -96,7 +96,6 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         before=before,
         nominal=nominal,
         residuals=_residuals(error, w, leverage, s, 3 * free, modulus, raw, force),
-        patterns=(np.full(1, np.nan), np.full(1, np.nan)),
         notes=_notes(sample),
     )
 
