@@ -452,6 +452,7 @@ def needs_look(output: Float, poses: Int) -> Bool:
         np.logical_or.reduce(equal)
         | many
         | _at_ends(axes, real)
+        | _keep_a_value(axes, real)
         | _is_odd(output, real)
         | (poses >= RAW_ROWS)
     )
@@ -465,6 +466,13 @@ def _at_ends(axes: Float, real: Bool) -> Bool:
     sizes = np.sort(np.abs(np.concatenate([low, high])), axis=0)
     near = ((sizes[1:] - sizes[:-1]) <= 1.0) & ((sizes[1:] == sizes[:-1]) | (np.fmod(sizes[1:], 1.0) == 0))
     return np.asarray((hits.sum(axis=(0, 2)) > 6) | near.any(axis=0))
+
+
+def _keep_a_value(axes: Float, real: Bool) -> Bool:
+    """Return which sensors have an axis with three equal values in a row in poses that differ: axes (3, R, J)."""
+    same = (axes[..., 1:] == axes[..., :-1]) & real[:, 1:]
+    alone = same & ~same.all(axis=0)
+    return np.asarray((alone[..., 1:] & alone[..., :-1]).any(axis=(0, 2)))
 
 
 def _is_odd(output: Float, real: Bool) -> Bool:
