@@ -21,9 +21,8 @@ from accelcal_cli.calibration.observability import (
     SCALE,
     PoseVerdict,
     poses_to_add,
-    unit,
 )
-from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, pattern_chance
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE
 from accelcal_cli.calibration.search import rounding
@@ -135,7 +134,7 @@ def assess(fit: Fit) -> Assessment:
             suggestions[at], reasons[at] = _advice(fit, at, unchecked[at])
     outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
-    left, (bent, drift) = _to_gain(fit), _patterns(fit)
+    left, (bent, drift) = _to_gain(fit), fit.patterns
     patterned = (bent < SURELY_PATTERN) | (drift < SURELY_PATTERN)
     for at in np.flatnonzero(_may_have_warnings(fit, left) | patterned).tolist():
         own = _patterns_in_words(float(bent[at]), float(drift[at]))
@@ -201,7 +200,7 @@ def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[
     if not known and attitudes < poses and view.verdict != "good":
         lines.insert(0, f"The {poses:,} poses have {attitudes} different attitudes, and those decide.")
     if unchecked.any():
-        which = [fit.sample.readings(at).where(pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
+        which = [fit.sample.where(at, pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
         lines.append(
             f"No other pose checks {_listed(which)}: an error there would not show. Take at least {FEWEST_POSES + 1}."
         )
@@ -249,23 +248,6 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     always |= settings.nominal is not None
     always |= fit.solution is not None and fit.solution.stated.tremor is not None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
-
-
-def _patterns(fit: Fit) -> tuple[Float, Float]:
-    """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
-
-    A quadratic and a cubic term of each axis; a bias that changes evenly from the first pose to the last.
-    """
-    residuals, sample = fit.residuals, fit.sample
-    poses = int(sample.poses.max())
-    if fit.solution is None or residuals.pose.shape[1] < poses or fit.solution.slopes is not None:
-        return np.full(len(sample), np.nan), np.full(len(sample), np.nan)
-    weights = fit.solution.robust_weights()
-    w = residuals.real.astype(float) if weights is None else weights
-    u = unit(residuals.force)
-    time = (residuals.pose / np.maximum(sample.poses[:, None] - 1, 1))[..., None]
-    bent = pattern_chance(residuals, w, np.concatenate([u**3, u**4], axis=2), fit.settings.g)
-    return bent, pattern_chance(residuals, w, time * u, fit.settings.g)
 
 
 def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_chance
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
-from accelcal_cli.calibration.sample import NO_NOISE, Sample
+from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error
 
 KEPT = 1000
 """Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""
@@ -45,6 +45,7 @@ class PoseResiduals:
 
     Attributes:
         pose: their numbers, from 0, shape (R, k); real: which are no repetitions, shape (R, k).
+        weight: in the fit, that of a robust loss included, shape (R, k).
         error, before: |f| - g after and before calibration, m/s^2, shape (R, k).
         force: calibrated specific force, gauge `lower`, m/s^2, shape (R, k, 3).
         leverage: part of the pose's own residual that the fit absorbs, shape (R, k).
@@ -55,6 +56,7 @@ class PoseResiduals:
 
     pose: Int
     real: Bool
+    weight: Float
     error: Float
     before: Float
     force: Float
@@ -73,11 +75,6 @@ def worst(columns: list[Float], sample: Sample) -> list[Float]:
     index = np.sort(np.argpartition(-size, last, axis=1)[:, :KEPT_WORST], axis=1)
     rows = np.arange(len(size))[:, None]
     return [column[rows, index] for column in columns]
-
-
-def length_error(e: Float, g: float) -> Float:
-    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
-    return np.asarray(np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g)
 
 
 def pose_residuals(
@@ -118,7 +115,7 @@ def pose_residuals(
         )
         outlier |= np.take_along_axis(rejected, number, axis=1)
     return PoseResiduals(
-        number, real, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
+        number, real, w, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
     )
 
 
@@ -199,15 +196,29 @@ FEWEST_SPARE = 3
 """Degrees of freedom that a test for a pattern leaves to the noise at least."""
 
 
-def pattern_chance(residuals: PoseResiduals, w: Float, columns: Float, g: float) -> Float:
+def bend_and_drift(residuals: PoseResiduals, poses: Int, g: float) -> tuple[Float, Float]:
+    """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
+
+    A quadratic and a cubic term of each axis; a bias that changes evenly from the first pose to the last.
+
+    Args:
+        residuals: of all poses; poses: J of each sensor, shape (R,); g: m/s^2.
+    """
+    u = unit(residuals.force)
+    time = (residuals.pose / np.maximum(poses[:, None] - 1, 1))[..., None]
+    bent = pattern_chance(residuals, np.concatenate([u**3, u**4], axis=2), g)
+    return bent, pattern_chance(residuals, time * u, g)
+
+
+def pattern_chance(residuals: PoseResiduals, columns: Float, g: float) -> Float:
     """Return the p-values of a pattern in the residuals, shape (R,), NaN where the poses cannot tell.
 
     The F test of a fit with q columns more: those of an error that the linear, constant model does not have.
 
     Args:
-        residuals: of all poses; w: their weights, shape (R, J); columns: of the pattern, shape (R, J, q); g: m/s^2.
+        residuals: of all poses; columns: of the pattern, shape (R, J, q); g: m/s^2.
     """
-    f = residuals.force
+    f, w = residuals.force, residuals.weight
     rows = np.concatenate([design(unit(f)), columns], axis=2)
     e = (g * g - np.sum(f * f, axis=2)) / (2.0 * g)
     normal = (rows * w[..., None]).swapaxes(1, 2) @ rows

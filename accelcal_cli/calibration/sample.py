@@ -141,9 +141,21 @@ class Sample:
         """R, the number of sensors."""
         return len(self.poses)
 
+    def where(self, at: int, pose: int) -> str:
+        """Return how to name a pose of the sensor number `at`: by its label or its line."""
+        return self.readings(at).where(pose)
+
     def real(self, first: int, width: int) -> Bool:
         """Return which of the poses from `first` on are no repetitions, shape (R, width)."""
         return np.asarray(np.arange(first, first + width) < self.poses[:, None])
+
+    def each_weight(self, weights: Float | None) -> Float:
+        """Return the weight of each pose, 1 where all count alike and 0 for repetitions, shape (R, J)."""
+        return self.real(0, int(self.poses.max())).astype(float) if weights is None else weights
+
+    def counted(self, rejected: Bool | None) -> Int:
+        """Return how many poses are not left out, shape (R,), of those marked in shape (R, J)."""
+        return self.poses if rejected is None else np.asarray(self.poses - rejected.sum(axis=1))
 
     def output(self) -> Float:
         """Return the outputs of all poses, shape (R, J, 3), output units."""
@@ -255,6 +267,11 @@ class Sample:
         for (first, block), (_, e, _) in zip(self.blocks(), self.errors(K, D, settings.g), strict=True):
             own: Float | float = 1.0 if weights is None else weights[:, first : first + e.shape[1]]
             yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
+
+
+def length_error(e: Float, g: float) -> Float:
+    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
+    return np.asarray(np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g)
 
 
 def loss_weight(z: Float, loss: Robust) -> Float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -83,9 +84,9 @@ def command(
     with process.even_if_unread():
         options.print_result(
             format,
-            lambda: views.pose_table(proposal),
-            lambda: views.blocks(proposal),
-            lambda: views.record(proposal),
+            partial(views.pose_table, proposal),
+            partial(views.blocks, proposal),
+            partial(views.record, proposal),
         )
     with process.even_if_unread(sys.stderr):
         if so_far is not None and format != "table":  # the table shows them itself

@@ -16,11 +16,11 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.clock import UNITS, Clock, seconds_of_dates, unit_of
+from accelcal_cli.io.clock import UNITS, Clock, SoundTimes, seconds_of_dates, unit_of, wrong_time
 from accelcal_cli.io.columns import RawColumns, choose_raw, restrict
-from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm
-from accelcal_cli.io.rows import OneSensor, ZeroRows
+from accelcal_cli.io.rows import SKIPPABLE, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.vocabulary import parse_unit
 
 PROBE = 1000
@@ -71,7 +71,13 @@ class RawLog:
         self._table = table
         dated = columns.dated
         rows = _of_one(table.blocks(columns.selection()), OneSensor(table, columns.identity, fleet=False))
-        self._rows = seconds_of_dates(rows, self._time_at, table.facts.day_first) if dated else rows
+        if dated:
+            rows = seconds_of_dates(rows, self._time_at, table.facts.day_first, lenient=table.lenient)
+        self._sound = None
+        if table.lenient and columns.time is not None and not columns.guessed:
+            self._sound = SoundTimes(table)
+            rows = self._sound.of(rows)
+        self._rows = rows
         self._head = _first(self._rows, PROBE)
         self.clock = Clock()
         self._notes = list(columns.notes)
@@ -122,10 +128,10 @@ class RawLog:
         return None if names is None else unit_of(names[column])
 
     def _time_at(self, row: int) -> str:
-        """Return how to name the time of a row (from 0) that has been read."""
+        """Return how to name the time of a row (from 0) of the table."""
         names, time = self._table.names, self.columns.time or 0
         column = str(time + 1) if names is None else f'"{names[time]}"'
-        return f"{self.name}, {self.where(row)}, column {column}"
+        return f"{self.name}, {self._table.where(row)}, column {column}"
 
     @property
     def form(self) -> InputForm:
@@ -141,7 +147,10 @@ class RawLog:
     @property
     def where(self) -> Callable[[int], str]:
         """How to name a row (from 0) that has been read."""
-        return self._table.where
+        if self._sound is None:
+            return self._table.where
+        where, line = self._table.where, self._sound.rows.line
+        return lambda row: where(line(row))
 
     def blocks(self) -> Iterator[Float]:
         """Yield the rows, block after block, in constant memory; time that goes back is a DataError.
@@ -184,9 +193,15 @@ class RawLog:
         if back.any():
             row = int(np.argmax(back))
             before = time[row - 1] if row else last
+            single = (
+                row
+                and not self._table.lenient
+                and wrong_time(time[max(row - 2, 0) :], min(row, 2)) is not None
+            )
+            few = SKIPPABLE if single else ""
             raise DataError(
                 f"{self.name}, {self.where(start + row)}: time {time[row]:.10g} comes after {before:.10g}; expected "
-                "time that never decreases (--time none leaves it out)"
+                f"time that never decreases (--time none leaves it out){few}"
             )
 
 

@@ -3,10 +3,12 @@
 `Clock` finds unit and rate from the times of the first rows. `StampReader` turns texts into seconds since the first:
 dates with the year, day or month first, clocks with hours or from the minutes on, 64-bit counts. Whether the day or the
 month comes first is told by the file: by a number above 12, by the lines above the table, or when the date changes.
+`SoundTimes` leaves out single rows whose time is none or falls, where broken rows are to be left out.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -17,10 +19,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import COUNTED, GUESSED
-from accelcal_cli.io.reader import RowBlock, shorten
+from accelcal_cli.io.reader import InputTable, shorten
+from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, RowBlock
 from accelcal_cli.io.vocabulary import parse_unit
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -176,18 +179,77 @@ def is_counted(cell: str) -> bool:
 
 
 def seconds_of_dates(
-    rows: Iterable[RowBlock], place: Callable[[int], str], day_first: bool | None = None
+    rows: Iterable[RowBlock],
+    place: Callable[[int], str],
+    day_first: bool | None = None,
+    *,
+    lenient: bool = False,
 ) -> Iterator[RowBlock]:
     """Yield rows whose first text is a time with the seconds since the first row as one more column.
 
     Args:
         rows: blocks with text; place: how to name a row (from 0) and its column.
         day_first: whether dates that do not begin with the year begin with the day; None to find out.
+        lenient: NaN for what is no time.
     """
-    reader = StampReader(place, day_first)
+    reader = StampReader(place, day_first, lenient)
     for block in rows:
         seconds = reader.seconds(list(block.texts[0]), block.start)
         yield RowBlock(block.start, np.column_stack([block.numbers, seconds]), block.texts[1:])
+
+
+def wrong_time(time: Float, row: int) -> int | None:
+    """Return which single row is wrong where time falls at a row: this one or the one before it, None for neither."""
+    if row + 1 < len(time) and time[row + 1] >= time[row - 1]:
+        return row
+    goes_on = row + 1 < len(time) and time[row + 1] >= time[row]
+    return row - 1 if goes_on and (row == 1 or time[row] >= time[row - 2]) else None
+
+
+@dataclass(eq=False)
+class SoundTimes:
+    """Leaves out single rows whose time, the last number of a block, is none or falls, and counts them as broken.
+
+    Attributes:
+        table: of the rows; rows: number in the table of each row that stays.
+    """
+
+    table: InputTable
+    rows: LineMap = field(default_factory=LineMap)
+    _before: Float = field(default_factory=lambda: np.empty(0))  # the last two times that were passed on
+    _kept: int = 0
+
+    def of(self, blocks: Iterable[RowBlock]) -> Iterator[RowBlock]:
+        """Yield the blocks without such rows; the last two wait for the next block, by which they are judged."""
+        held, at = None, np.empty(0, dtype=np.int64)
+        for block in blocks:
+            held = block if held is None else held.joined(block)
+            at = np.append(at, block.start + np.arange(len(block.numbers)))
+            held, at = self._sound(held, at, last=False)
+            first = np.arange(len(at)) < len(at) - 2
+            yield self._passed(held.only(first), at[first])
+            held, at = held.only(~first), at[~first]
+        if held is not None:
+            yield self._passed(*self._sound(held, at, last=True))
+
+    def _sound(self, block: RowBlock, at: Int, *, last: bool) -> tuple[RowBlock, Int]:
+        time = block.numbers[:, -1]
+        bad, known = np.isnan(time), np.flatnonzero(~np.isnan(time))
+        times, skip = np.append(self._before, time[known]), len(self._before)
+        for row in (np.flatnonzero(np.diff(times) < 0) + 1).tolist():
+            wrong = row if last and row + 1 == len(times) else wrong_time(times, row)
+            if wrong is not None and wrong >= skip:
+                bad[known[wrong - skip]] = True
+        for row in at[bad].tolist():
+            self.table.leave_out(row)
+        return block.only(~bad), at[~bad]
+
+    def _passed(self, block: RowBlock, at: Int) -> RowBlock:
+        start = self._kept
+        self.rows.add_many(start + np.arange(len(at)), at)
+        self._kept += len(at)
+        self._before = np.append(self._before, block.numbers[:, -1])[-2:]
+        return RowBlock(start, block.numbers, block.texts)
 
 
 @dataclass(frozen=True)
@@ -206,10 +268,12 @@ class StampReader:
 
     Attributes:
         place: how to name a row (from 0) and its column; day_first: None until it is known.
+        lenient: a cell that is no time is NaN.
     """
 
     place: Callable[[int], str]
     day_first: bool | None = None
+    lenient: bool = False
     _iso: tuple[np.datetime64, str] | None = None  # the first time, and the zone of all
     _first: _Stamp | None = None
     _start: float = 0.0
@@ -230,10 +294,19 @@ class StampReader:
         if self._first is None and self._base is None and self._iso is None:
             self._begin(cells[0])
         if self._base is not None:
-            return self._counts(cells, start)
-        if self._iso is not None:
-            return self._dates(cells, start)
-        return np.array([self._second(cell, start + k) for k, cell in enumerate(cells)])
+            seconds = self._counts(cells)
+        elif self._iso is not None:
+            seconds = self._dates(cells)
+        else:
+            seconds = np.array([self._second(cell, start + k) for k, cell in enumerate(cells)])
+        wrong = np.flatnonzero(np.isnan(seconds))
+        if len(wrong) and not self.lenient:
+            few = SKIPPABLE if len(wrong) <= MOST_BAD * len(cells) else ""
+            raise DataError(
+                f"{self.place(start + int(wrong[0]))}: {shorten(cells[wrong[0]])} is not a time; expected numbers, or "
+                f"dates as 2026-03-01T12:30:00.25, all in one time zone (--time none leaves it out){few}"
+            )
+        return seconds
 
     def _begin(self, cell: str) -> None:
         """Take the style of the first cell."""
@@ -247,13 +320,14 @@ class StampReader:
             except (ValueError, UserWarning):
                 self._iso = None
 
-    def _counts(self, cells: list[str], start: int) -> Float:
+    def _counts(self, cells: list[str]) -> Float:
+        base = self._base or 0
         try:
-            return np.array([int(cell) - (self._base or 0) for cell in cells], dtype=np.float64)
+            return np.array([int(cell) - base for cell in cells], dtype=np.float64)
         except ValueError:
-            raise self._fault(cells, start, is_counted) from None
+            return np.array([int(cell) - base if is_counted(cell) else math.nan for cell in cells])
 
-    def _dates(self, cells: list[str], start: int) -> Float:
+    def _dates(self, cells: list[str]) -> Float:
         first, zone = self._iso or (np.datetime64(0, "s"), "")
         bare = [cell.replace(",", ".").removesuffix(zone) for cell in cells]
         try:
@@ -263,17 +337,17 @@ class StampReader:
             if np.isnat(stamps).any():
                 raise ValueError
         except (ValueError, UserWarning):
-            raise self._fault(
-                cells, start, lambda cell: _is_iso(cell.replace(",", ".").removesuffix(zone))
-            ) from None
-        return np.asarray((stamps - first).astype(np.int64) / 1e9)
+            stamps = _read([cell if _is_iso(cell) else "NaT" for cell in bare])
+        return np.where(np.isnat(stamps), math.nan, (stamps - first).astype(np.int64) / 1e9)
 
     def _second(self, cell: str, row: int) -> float:
-        """Return the seconds of one cell since the first."""
+        """Return the seconds of one cell since the first, NaN where it is no time."""
         stamp = _parse(cell)
         if stamp is None or (self._first is not None and not _alike(stamp, self._first)):
-            raise self._fault([cell], row, lambda _: False)
+            return math.nan
         day = self._midnight(stamp.date, row) if stamp.date else 0.0
+        if math.isnan(day):
+            return day
         seconds = stamp.seconds - (stamp.zone or 0.0) + day
         if not stamp.date:
             if seconds + self._wrapped < self._last - stamp.period / 2:
@@ -285,31 +359,28 @@ class StampReader:
         return round(seconds - self._start, 9)
 
     def _midnight(self, text: str, row: int) -> float:
-        """Return midnight of a date in seconds since that of the first date."""
+        """Return midnight of a date in seconds since that of the first date, NaN where it is no date."""
         known = self._days.get(text)
         if known is not None:
             self._previous = text
             return known
+        if not (_is_date(text, True) or _is_date(text, False)):
+            return math.nan
         if not self._days:
+            self._settle(text)
             self._days[text] = 0.0
-            self._settle(text, row)
         else:
             first = next(iter(self._days))
             self._settle_change(self._previous, text, row)
-            try:
-                self._days[text] = 86400.0 * (
-                    _ordinal(text, self.day_first) - _ordinal(first, self.day_first)
-                )
-            except ValueError:
-                raise self._fault([text], row, lambda _: False) from None
+            if not _is_date(text, self.day_first):
+                return math.nan
+            self._days[text] = 86400.0 * (_ordinal(text, self.day_first) - _ordinal(first, self.day_first))
         self._previous = text
         return self._days[text]
 
-    def _settle(self, text: str, row: int) -> None:
+    def _settle(self, text: str) -> None:
         """Find the order of day and month where one date tells it."""
         orders = [order for order in (True, False) if _is_date(text, order)]
-        if not orders:
-            raise self._fault([text], row, lambda _: False)
         if len(orders) == 1 or _ordinal(text, True) == _ordinal(text, False):
             self.day_first = orders[0] if self.day_first is None and len(orders) == 1 else self.day_first
 
@@ -330,13 +401,6 @@ class StampReader:
                 "write dates as 2026-03-01, or leave time out with --time none"
             )
         self.day_first = next_day[0]
-
-    def _fault(self, cells: list[str], start: int, sound: Callable[[str], bool]) -> DataError:
-        wrong = next((k for k, cell in enumerate(cells) if not sound(cell)), 0)
-        return DataError(
-            f"{self.place(start + wrong)}: {shorten(cells[wrong])} is not a time; expected numbers, or dates as "
-            "2026-03-01T12:30:00.25, all in one time zone (--time none leaves it out)"
-        )
 
 
 def _read(cells: list[str]) -> NDArray[np.datetime64]:

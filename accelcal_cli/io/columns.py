@@ -15,9 +15,19 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
-from accelcal_cli.io.reader import InputTable, RowBlock, Selection
-from accelcal_cli.io.roles import Roles, Triple, bare_name, listed, recognise
-from accelcal_cli.io.vocabulary import FORCE_UNITS, describe, name_unit, parse_unit
+from accelcal_cli.io.reader import InputTable, Selection
+from accelcal_cli.io.rows import Condition, RowBlock, RowFilter
+from accelcal_cli.io.vocabulary import (
+    FORCE_UNITS,
+    Roles,
+    Triple,
+    bare_name,
+    describe,
+    listed,
+    name_unit,
+    parse_unit,
+    recognise,
+)
 
 COUNTED = 16
 """Digits from which on a time is read as an integer: a 64-bit float would round it."""
@@ -337,8 +347,6 @@ def restrict(table: InputTable, where: Sequence[str]) -> None:
     """
     if not where:
         return
-    from accelcal_cli.io.rows import Condition, RowFilter  # which itself knows columns
-
     conditions = []
     for text in where:
         word, equals, value = text.partition("=")
@@ -506,11 +514,6 @@ def _with_extras(
     if names is not None and used:
         notes = (*notes, f"column{'s' * (len(used) > 1)} {listed(names, used)} found")
     return replace(columns, notes=(*notes, *roles.partial))
-
-
-def is_kind(name: str) -> bool:
-    """Return whether a column, by its name, holds kinds: of sensors perhaps, or of poses."""
-    return bool(recognise((name,)).alone["kind"])
 
 
 def _identity(roles: Roles, taken: set[int | None]) -> tuple[int, ...]:

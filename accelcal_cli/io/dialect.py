@@ -1,7 +1,9 @@
-"""How a text is written: separator, decimal mark, header, words between numbers; `understand` finds it from the head.
+"""How a text is written and where its table begins; `understand` finds it from the head.
 
-The parsers of reader.py and the writer of rewrite.py share the reading of one line that is defined here; what stands
-above a table is told apart in preamble.py.
+Separator and decimal mark come first (`sniff`). Devices write a page about themselves above their readings: the first
+row is found by what rows are, lines of one width with numbers in the same places, and the lines above it are the
+header, units, or a preamble (`find_layout`). The parsers of reader.py and the writer of rewrite.py share the reading of
+one line that is defined here.
 """
 
 from __future__ import annotations
@@ -9,13 +11,25 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.lines import LineFilter, find_filter
-from accelcal_cli.io.preamble import AHEAD, LAYOUTS, Facts, find_layout, is_known, read_facts
 from accelcal_cli.io.stream import LONGEST_LINE
-from accelcal_cli.io.vocabulary import is_unit_row
+from accelcal_cli.io.vocabulary import (
+    LAYOUTS,
+    Facts,
+    describe,
+    is_time,
+    is_unit_row,
+    parse_unit,
+    read_facts,
+)
+
+if TYPE_CHECKING:
+    from accelcal_cli.io.lines import LineFilter
 
 SAMPLE = 1000
 """Content lines that the dialect is found from."""
@@ -27,6 +41,21 @@ MARKS = ("#", "//", "%")
 """What a line of comment begins with."""
 
 BOM = b"\xef\xbb\xbf"
+
+TAIL = 64
+"""Last lines of a sample by which rows are known: what stands above a table is no longer among them."""
+
+AHEAD = 20
+"""Lines after the first row of which most have to be rows, too."""
+
+MOST = 0.6
+"""Part that is most."""
+
+EPOCH = 1e8
+"""A first row of one number, at least this large, is the start of a recording in seconds since 1970."""
+
+FAR = 50.0
+"""A row of running numbers is a header where the rows below it are so many times larger."""
 
 _QUOTED = re.compile(r'"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
@@ -77,6 +106,24 @@ class Dialect:
         return MARKS if self.separator == ";" else (*MARKS, ";")
 
 
+@dataclass(frozen=True)
+class Layout:
+    """Lines of a sample by what they are, numbered from 0.
+
+    Attributes:
+        first: of the first row; beyond the last line where there are no rows.
+        names: of the columns, None where there is no header; header: its line, None where it has none of its own.
+        units: cells of the row of units, None where there is none.
+        rate: that a row of numbers above the table states, Hz.
+    """
+
+    first: int
+    names: tuple[str, ...] | None = None
+    header: int | None = None
+    units: tuple[str, ...] | None = None
+    rate: float | None = None
+
+
 def split_cells(line: str, separator: str) -> list[str]:
     """Return the cells of one line, stripped of blanks and quotes."""
     if '"' not in line:
@@ -122,6 +169,8 @@ def understand(
             fault = problem
         if dialect is not None and not _is_worded(dialect):
             return None, dialect
+    from accelcal_cli.io.lines import find_filter  # most texts have no words between their numbers
+
     lines = head[: 1 << 18].decode(errors="replace").splitlines()[skip:]
     found = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
     if found is None:
@@ -158,7 +207,7 @@ def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:
     if separator == " " and _names_tabs(texts, dense):
         separator = "\t"
     rows = [split_cells(text, separator) for text in texts]
-    layout = find_layout(rows, looks_numeric, lambda k: _other_cells(texts[k], separator))
+    layout = find_layout(texts, rows, separator)
     first = rows[layout.first] if layout.first < len(rows) else []
     numbers = [number for number, _ in lines]
     names, header = layout.names, 0 if layout.header is None else numbers[layout.header]
@@ -348,3 +397,147 @@ def _names_of_comments(
                 names = tuple(cells)
             break
     return names, units
+
+
+def find_layout(texts: Sequence[str], rows: Sequence[Sequence[str]], separator: str) -> Layout:
+    """Find header, units and first row among the lines of a sample, as texts and as the cells of each."""
+    width, numeric = _profile(rows[-TAIL:] if len(rows) > 2 * TAIL else rows[len(rows) // 2 :])
+    if not numeric:
+        bare = bool(rows) and not any(looks_numeric(cell) for cell in rows[0])
+        return Layout(1, tuple(rows[0]), 0) if bare else Layout(0)
+    alike = [_is_row(cells, width, numeric) for cells in rows]
+    first = _first_row(rows, alike)
+    start = _stated_start(rows[first : first + 2])
+    if start is not None:
+        return Layout(first + start[0], rate=start[1])
+    if first == 0 and _is_numbered_header(rows[:AHEAD]):
+        return Layout(first + 1, tuple(rows[first]), first)
+    return _with_header(texts, rows, first, width, separator)
+
+
+def fits(cells: Sequence[str], width: int) -> bool:
+    """Return whether a line has `width` cells, with or without an empty one at its end."""
+    return len(cells) == width or (len(cells) == width + 1 and not cells[-1])
+
+
+def _profile(rows: Sequence[Sequence[str]]) -> tuple[int, list[int]]:
+    """Return the usual width of rows, and the columns that mostly hold numbers."""
+    widths = Counter(len(cells) for cells in rows if any(looks_numeric(cell) for cell in cells))
+    if not widths:
+        return 0, []
+    width = widths.most_common(1)[0][0]
+    alike = [cells for cells in rows if len(cells) == width]
+    numeric = []
+    for k in range(width):
+        filled = [looks_numeric(cells[k]) for cells in alike if cells[k]]
+        if filled and sum(filled) >= MOST * len(filled):
+            numeric.append(k)
+    return width, numeric
+
+
+def _is_row(cells: Sequence[str], width: int, numeric: Sequence[int]) -> bool:
+    if abs(len(cells) - width) > 1:
+        return False
+    filled = [looks_numeric(cells[k]) for k in numeric if k < len(cells) and cells[k]]
+    return bool(filled) and (2 * sum(filled) >= len(filled) if fits(cells, width) else all(filled))
+
+
+def _first_row(rows: Sequence[Sequence[str]], alike: Sequence[bool]) -> int:
+    """Return the first of a stretch of rows, or a line of nothing but numbers just above it, which is a broken row."""
+    first = next(
+        (
+            k
+            for k, row in enumerate(alike)
+            if row and sum(alike[k : k + AHEAD]) >= MOST * len(alike[k : k + AHEAD])
+        ),
+        0,
+    )
+    while first and len(rows[first - 1]) > 1 and all(looks_numeric(cell) for cell in rows[first - 1] if cell):
+        first -= 1
+    return first
+
+
+def _stated_start(rows: Sequence[Sequence[str]]) -> tuple[int, float | None] | None:
+    """Return how many rows state start and rate, the same number in every column, and the rate; None for none."""
+    equal = [len(cells) > 2 and len(set(cells)) == 1 and looks_numeric(cells[0]) for cells in rows]
+    if not (equal and equal[0] and float(rows[0][0].replace(",", ".")) >= EPOCH):
+        return None
+    second = len(rows) > 1 and equal[1]
+    return 1 + second, float(rows[1][0].replace(",", ".")) if second else None
+
+
+def _is_numbered_header(rows: Sequence[Sequence[str]]) -> bool:
+    """Return whether the first row numbers the columns, as data-frame libraries do for a nameless array."""
+    if len(rows) < 2 or len(rows[1]) != len(rows[0]):
+        return False
+    tail = rows[0][1:] if not rows[0][0] else rows[0]
+    if not any(list(tail) == [str(k + base) for k in range(len(tail))] for base in (0, 1)) or len(tail) < 2:
+        return False
+    below = [cells[-len(tail) :] for cells in rows[1:] if len(cells) == len(rows[0])]
+    if all("." in cell for cell in below[0]):
+        return True
+    try:
+        sizes = sorted(max(abs(float(cell)) for cell in cells if cell) for cells in below)
+    except ValueError:
+        return False
+    return sizes[len(sizes) // 2] > FAR * len(tail)
+
+
+def _with_header(
+    texts: Sequence[str], rows: Sequence[Sequence[str]], first: int, width: int, separator: str
+) -> Layout:
+    block: dict[int, list[str]] = {}
+    for k in range(first - 1, -1, -1):
+        forms = [list(rows[k]), *(_other_cells(texts[k], separator) if k == first - 1 or not block else [])]
+        whole = next((cells for cells in forms if _is_title(cells, rows[first], width)), None)
+        if whole is None:
+            break
+        block[k] = whole
+    if not block:
+        wrong = (
+            first and is_known(rows[first - 1]) and not any(looks_numeric(cell) for cell in rows[first - 1])
+        )
+        return Layout(first, tuple(rows[first - 1]), first - 1) if wrong else Layout(first)
+    units = [k for k in block if is_unit_row(block[k])]
+    titles = [k for k in block if k not in units]
+    if not titles:  # the names stand in a comment
+        return Layout(first, units=tuple(block[max(units)]))
+    header = max(titles, key=lambda k: (_score(block[k]), k))
+    below = next((tuple(block[k]) for k in units if k > header and any(map(_says, block[k]))), None)
+    names = _grouped(block.get(header - 1) if header - 1 in titles else None, block[header])
+    return Layout(first, tuple(names), header, below)
+
+
+def _is_title(cells: Sequence[str], row: Sequence[str], width: int) -> bool:
+    """Return whether a line can be a header of rows: as many cells, few of them numbers."""
+    ended = len(cells) == width - 1 and not row[-1]  # rows with a separator at their end
+    if not (fits(cells, width) or ended) or not any(cells):
+        return False
+    numbers = sum(looks_numeric(cell) for cell in cells)
+    return not numbers or (is_known(cells) and 2 * numbers < sum(bool(cell) for cell in cells))
+
+
+def _says(unit: str) -> bool:
+    return parse_unit(unit) not in (None, "-")
+
+
+def _score(names: Sequence[str]) -> int:
+    """Return how many cells of a line are names that are known."""
+    return sum(bool(name) and (is_time(name) or describe(name).axis is not None) for name in names)
+
+
+def is_known(names: Sequence[str]) -> bool:
+    """Return whether cells are names of columns, of which some say what they are."""
+    return len(names) > 1 and _score(names) > 1
+
+
+def _grouped(groups: Sequence[str] | None, names: Sequence[str]) -> Sequence[str]:
+    """Return names that occur twice with the name of their group, which stands above the first of them."""
+    filled = [name for name in names if name]
+    if groups is None or len(set(filled)) == len(filled) or len(groups) != len(names):
+        return names
+    whole, group = [], ""
+    for above, name in zip(groups, names, strict=True):
+        group = above or group
+        whole.append(f"{group} {name}".strip())
+    return whole

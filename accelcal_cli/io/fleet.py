@@ -18,9 +18,9 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict, sensor_column
-from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, RowBlock, open_table
+from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
-from accelcal_cli.io.rows import ZeroRows, add_stretches, places, zero_rows
+from accelcal_cli.io.rows import RowBlock, ZeroRows, add_stretches, places, zero_rows
 from accelcal_cli.io.screening import LOOKED_AT, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
 from accelcal_cli.notices import Notice

@@ -13,11 +13,11 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.preamble import Facts
-from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, RowBlock, Selection
+from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection
 from accelcal_cli.io.rewrite import Change, system_errors
-from accelcal_cli.io.rows import RowFilter
+from accelcal_cli.io.rows import RowBlock, RowFilter
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
+from accelcal_cli.io.vocabulary import Facts
 
 ROWS = 500_000
 """Rows of a block."""
@@ -35,6 +35,7 @@ class ParquetTable:
     source_format = "parquet"
     notes: tuple[str, ...] = ()
     rows_skipped = 0
+    lenient = False  # its cells have types: none is broken
 
     def __init__(self, source: ByteSource, path: Path | None) -> None:
         """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
@@ -62,6 +63,9 @@ class ParquetTable:
         """SHA-256 of the file."""
         self._hashing.wait()
         return self._source.sha256
+
+    def leave_out(self, row: int) -> None:
+        """Never called: no row is broken."""
 
     def preview(self) -> list[list[str]]:
         """Return the cells of those of the first rows that are read."""

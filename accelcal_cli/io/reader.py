@@ -10,14 +10,14 @@ from __future__ import annotations
 import io
 import math
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import (
     BOM,
@@ -31,14 +31,12 @@ from accelcal_cli.io.dialect import (
     split_cells,
     understand,
 )
-from accelcal_cli.io.preamble import Facts
-from accelcal_cli.io.skipped import LineMap, PassedLines
+from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
 from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
+from accelcal_cli.io.vocabulary import Facts
 
 if TYPE_CHECKING:
     import polars as pl
-
-    from accelcal_cli.io.rows import RowFilter
 
 LIMIT = 1e100
 """Largest reading: greater values cannot be squared safely."""
@@ -48,8 +46,8 @@ SHOWN = 40
 
 NO_LABEL = "is empty; every row needs its label"
 
-MOST_BAD = 0.05
-"""Part of the rows that --skip-bad leaves out at most."""
+NEARBY = 1000
+"""Lines after a broken one that show whether few are."""
 
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
 
@@ -85,18 +83,6 @@ class Selection:
     texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
     needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
     carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
-
-
-@dataclass(frozen=True, eq=False)
-class RowBlock:
-    """Rows of a table: `numbers` (B, k) and `texts`, each of length B, in the order of the selection.
-
-    `start` is the number of the first row in the table, from 0.
-    """
-
-    start: int
-    numbers: Float
-    texts: tuple[Sequence[str], ...] = ()
 
 
 class InputTable(Protocol):
@@ -140,6 +126,13 @@ class InputTable(Protocol):
     @property
     def rows_skipped(self) -> int:
         """Rows left out as broken so far."""
+
+    @property
+    def lenient(self) -> bool:
+        """Whether broken rows are to be left out."""
+
+    def leave_out(self, row: int) -> None:
+        """Count a row (from 0) that has been read among the broken ones."""
 
     def preview(self) -> list[list[str]]:
         """Return the cells of some of the first rows that are read."""
@@ -194,7 +187,7 @@ class TextTable:
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
         self.has_rows = bool(self.dialect.first)
-        self.passed = PassedLines()
+        self.passed, self.lenient = PassedLines(), options.skip_bad
         self.filter: RowFilter | None = None
         self._lines = LineMap()
 
@@ -233,6 +226,10 @@ class TextTable:
             notes.append(note)
         return (*notes, *self.passed.notes())
 
+    def leave_out(self, row: int) -> None:
+        """Count a row (from 0) that has been read among the broken ones."""
+        self.passed.bad.append(self._lines.line(row))
+
     def preview(self) -> list[list[str]]:
         """Return the cells of some rows of the head that are read, spread over it."""
         head = self._source.head if self._words is None else self._words.translate(self._source.head)
@@ -260,9 +257,7 @@ class TextTable:
 
     def pairs(self, selection: Selection) -> Iterator[tuple[bytes, RowBlock]]:
         """Read blocks of whole lines, each with the selected columns of its rows."""
-        careful = CarefulParser(
-            self.name, self.dialect, selection, self.filter, lenient=self._options.skip_bad
-        )
+        careful = CarefulParser(self.name, self.dialect, selection, self.filter, lenient=self.lenient)
         self._lines, self.passed = careful.lines, careful.passed
         parse = careful.parse if self._source.whole else FastParser(careful).parse
         for raw in self._source.blocks():
@@ -317,15 +312,18 @@ class CarefulParser:
         """Return the rows of a block of whole lines; the first wrong cell raises DataError."""
         start, values, top = self.row, array("d"), max(self.dialect.top, self.dialect.header_line)
         texts: tuple[list[str], ...] = tuple([] for _ in self.selection.texts)
-        for raw in io.BytesIO(block):
+        lines = io.BytesIO(block)
+        for raw in lines:
             self.line += 1
             if self.line <= top:
                 continue
             try:
                 parts = self._parts(raw)
-            except DataError:
+            except DataError as fault:
                 if self._is_passed(raw):
                     continue
+                if self._few_are_broken(lines):
+                    raise DataError(f"{fault}{SKIPPABLE}") from fault
                 raise
             if parts is None:
                 continue
@@ -336,6 +334,17 @@ class CarefulParser:
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
         return RowBlock(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+
+    def _few_are_broken(self, lines: Iterable[bytes]) -> bool:
+        """Return whether --skip-bad would leave out this row, going by the rows so far and the next lines."""
+        rows, bad = self.row, 1
+        for raw in islice(lines, NEARBY):
+            self.line += 1
+            try:
+                rows += self._parts(raw) is not None
+            except DataError:
+                bad += 1
+        return bad <= MOST_BAD * (bad + rows)
 
     def check_passed(self) -> None:
         """Refuse a table of which too many rows are broken."""

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, are_no_counts, choose, restrict
-from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, RowBlock, open_table
-from accelcal_cli.io.rows import OneSensor, ZeroRows
+from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, open_table
+from accelcal_cli.io.rows import OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 from accelcal_cli.notices import Notice

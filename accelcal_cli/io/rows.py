@@ -1,15 +1,19 @@
-"""Which rows of a table are read: those that meet conditions, that are no zeros of an idle logger, of one sensor.
+"""The rows of a table: on which lines they are, and which of them are read.
 
-A `RowFilter` is what `--where COLUMN=VALUE` means. It goes before the parser: rows that do not meet the conditions are
-never parsed, so that they may hold what no reading may, and it remembers where the rows that stay came from, so that
-messages name the lines of the input. `ZeroRows` and `OneSensor` look at the rows that have been parsed.
+A `RowBlock` is some rows that have been parsed, a `LineMap` says on which line each row is, and `PassedLines` which
+lines are no rows. A `RowFilter` is what `--where COLUMN=VALUE` means. It goes before the parser: rows that do not meet
+the conditions are never parsed, so that they may hold what no reading may, and it remembers where the rows that stay
+came from, so that messages name the lines of the input. `ZeroRows` and `OneSensor` look at the rows that have been
+parsed.
 """
 
 from __future__ import annotations
 
+import bisect
 import io
 import re
 import shlex
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
@@ -19,14 +23,24 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.columns import is_kind
 from accelcal_cli.io.dialect import BOM, MARKS, Dialect, is_blank, is_comment, split_cells
-from accelcal_cli.io.reader import InputTable, RowBlock
-from accelcal_cli.io.skipped import LineMap
+from accelcal_cli.io.vocabulary import is_kind
 from accelcal_cli.notices import Notice
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from accelcal_cli.io.reader import InputTable
+
+MOST_BAD = 0.05
+"""Part of the rows that --skip-bad leaves out at most."""
+
+SKIPPABLE = "; --skip-bad leaves out broken rows"
+"""What ends the refusal of a row that is one of few broken ones."""
+
+NAMED = 8
+"""Lines that a note names at most."""
+
 
 VALUES = 8
 """Values of a column that a message shows at most."""
@@ -42,6 +56,106 @@ MOST_SENSORS = 1000
 
 KIND_OF_SENSOR = re.compile(r"acc|gyr|mag|baro|imu|linear|gravity|rot|compass|temp", re.IGNORECASE)
 ACCELEROMETER = re.compile(r".*acc", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class RowBlock:
+    """Rows of a table: `numbers` (B, k) and `texts`, each of length B, in the order of the selection.
+
+    `start` is the number of the first row in the table, from 0.
+    """
+
+    start: int
+    numbers: Float
+    texts: tuple[Sequence[str], ...] = ()
+
+    def only(self, keep: Bool) -> RowBlock:
+        """Return the rows that `keep`, shape (B,), marks, numbered as before."""
+        texts = tuple(list(compress(text, keep.tolist())) for text in self.texts)
+        return RowBlock(self.start, self.numbers[keep], texts)
+
+    def joined(self, other: RowBlock) -> RowBlock:
+        """Return these rows and those of another block after them."""
+        texts = tuple([*text, *more] for text, more in zip(self.texts, other.texts, strict=True))
+        return RowBlock(self.start, np.concatenate([self.numbers, other.numbers]), texts)
+
+
+@dataclass
+class LineMap:
+    """Line number of every row, kept as the places where lines and rows diverge (blank lines, comments)."""
+
+    rows: array[int] = field(default_factory=lambda: array("q"))
+    lines: array[int] = field(default_factory=lambda: array("q"))
+
+    def add(self, row: int, line: int) -> None:
+        """Note that `row` (from 0) is on `line` (from 1); the rows after it follow line by line."""
+        if not self.rows or line - row != self.lines[-1] - self.rows[-1]:
+            self.rows.append(row)
+            self.lines.append(line)
+
+    def add_many(self, rows: Int, lines: Int) -> None:
+        """Note that each of some rows, ascending, is on its line."""
+        if not len(rows):
+            return
+        self.add(int(rows[0]), int(lines[0]))
+        breaks = np.flatnonzero(np.diff(lines - rows)) + 1
+        self.rows.frombytes(rows[breaks].astype(np.int64).tobytes())
+        self.lines.frombytes(lines[breaks].astype(np.int64).tobytes())
+
+    def line(self, row: int) -> int:
+        """Return the line number of a row."""
+        k = bisect.bisect_right(self.rows, row) - 1
+        return self.lines[k] + row - self.rows[k]
+
+    def where(self, row: int) -> str:
+        """Return how to name a row: ``line 8``."""
+        return f"line {self.line(row)}"
+
+
+@dataclass(eq=False)
+class PassedLines:
+    """Lines below the header that are no rows: broken, cut off, headers again, of other sensors.
+
+    Attributes:
+        bad: numbers of broken lines; headers: of repeated headers; merged: how many lines are of other sensors.
+        cut: number of the last line, if it was cut off.
+        kept: where the lines come from, if only some of the input were looked at; the numbers above count these.
+    """
+
+    bad: array[int] = field(default_factory=lambda: array("q"))
+    headers: array[int] = field(default_factory=lambda: array("q"))
+    merged: int = 0
+    cut: int | None = None
+    kept: LineMap | None = None
+
+    def lines(self) -> list[int]:
+        """Return the numbers of lines that are broken, cut off, or headers again."""
+        return [*self.bad, *self.headers, *(() if self.cut is None else (self.cut,))]
+
+    def notes(self) -> list[str]:
+        """Say what was left out."""
+        notes = []
+        if self.bad:
+            plural = "s" * (len(self.bad) != 1)
+            notes.append(
+                f"{len(self.bad):,} broken row{plural} left out (--skip-bad): {self.named(self.bad)}"
+            )
+        if self.cut is not None:
+            notes.append(f"the last line, {self._line(self.cut):,}, left out: it is cut off")
+        if self.headers:
+            notes.append(f"the header is repeated and left out: {self.named(self.headers)}")
+        if self.merged:
+            notes.append(f"{self.merged:,} rows left out: their cells of the readings are empty")
+        return notes
+
+    def named(self, numbers: Sequence[int]) -> str:
+        """Return how a message names lines of the input: ``lines 5, 9 and 3 more``."""
+        shown = ", ".join(str(self._line(number)) for number in sorted(numbers)[:NAMED])
+        more = f" and {len(numbers) - NAMED:,} more" if len(numbers) > NAMED else ""
+        return f"line{'s' * (len(numbers) != 1)} {shown}{more}"
+
+    def _line(self, number: int) -> int:
+        return number if self.kept is None else self.kept.line(number)
 
 
 @dataclass(frozen=True)
@@ -215,10 +329,7 @@ class ZeroRows:
     def without(self, rows: RowBlock) -> RowBlock:
         """Return a block, whose first three numbers are the output, without such rows."""
         keep = self.keep(rows.numbers[:, :3], rows.start)
-        if keep is None:
-            return rows
-        texts = tuple(list(compress(text, keep.tolist())) for text in rows.texts)
-        return RowBlock(rows.start, rows.numbers[keep], texts)
+        return rows if keep is None else rows.only(keep)
 
     def keep(self, output: Float, start: int) -> Bool | None:
         """Return which rows stay, shape (B,), or None for all; output (B, 3), `start` the number of the first."""

@@ -13,8 +13,8 @@ from simulated import MEMS, noise
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
 from accelcal_cli.calibration.fleet import FAILED, calibrate_fleet, standouts
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid, least_squares
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
-from accelcal_cli.calibration.triangle import compress_each, fit_ellipsoid, least_squares
 from accelcal_cli.errors import AccelcalError, ConfigError, DataError
 from accelcal_cli.io.fleet import read_fleet
 from accelcal_cli.io.readings import read_readings

@@ -7,7 +7,9 @@ import pytest
 from raw_logs import opened, simulated, text
 
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.io.clock import Clock, unit_of
+from accelcal_cli.io.clock import Clock, SoundTimes, unit_of
+from accelcal_cli.io.reader import ReadOptions
+from accelcal_cli.io.rows import RowBlock
 
 LOG, _ = simulated(2, hold=4.0)
 A, W, T = LOG[:, :3], LOG[:, 3:6], LOG[:, 6:]
@@ -224,3 +226,85 @@ def test_parquet_reads_as_text_does(tmp_path):
     polars.DataFrame(np.hstack([T, A]), schema=["t", "ax", "ay", "az"]).write_parquet(path)
     log = open_raw_log(path)
     np.testing.assert_array_equal(read(log), np.hstack([A, T]))
+
+
+STYLES = {
+    "ISO": str,
+    "clock": lambda stamp: stamp[11:],
+    "day first": lambda stamp: f"{stamp[8:10]}.{stamp[5:7]}.{stamp[:4]} {stamp[11:]}",
+    "integers": lambda stamp: str(np.datetime64(stamp, "ns").astype(np.int64)),
+}
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize(
+    "wrong", ["now", "early", "late", "13.13.2026 25:61:00", "2026-02-28T23:59:59+01:00"]
+)
+@pytest.mark.parametrize("row", [2, 500, 999, 1500, 2000])
+def test_a_row_of_a_wrong_time_is_a_broken_one(style, wrong, row):
+    times = np.arange(2000) * 0.01
+    form = STYLES[style]
+
+    def stamp(seconds):
+        return form(
+            str(np.datetime64("2026-02-28T12:00:00.000") + np.timedelta64(round(1e3 * seconds), "ms"))
+        )
+
+    texts = [stamp(t) for t in times]
+    texts[row - 1] = {"early": stamp(times[row - 1] - 50), "late": stamp(times[row - 1] + 50)}.get(
+        wrong, wrong
+    )
+    lines = [f"{t},{k},{k % 7},{k % 11 + 1}" for k, t in enumerate(texts)]
+    data = "\n".join(["time,ax,ay,az", *lines, ""]).encode()
+    end = row == 2000 and wrong == "late"  # nothing comes after it
+    if not end:
+        with pytest.raises(DataError, match=rf"line {row + 1}\b|line {row + 2}\b") as told:
+            read(opened(data))
+        assert "--skip-bad" in str(told.value) or row == 2000
+    log = opened(data, options=ReadOptions(skip_bad=True))
+    rows = read(log)
+    if not end:
+        np.testing.assert_array_equal(rows[:, 0], np.delete(np.arange(2000), row - 1))
+        scale = 1e-9 if style == "integers" else 1.0
+        np.testing.assert_allclose(scale * rows[:, -1], np.delete(times, row - 1), atol=1e-9)
+        assert f"1 broken row left out (--skip-bad): line {row + 1}" in log.notes
+        assert log.form.rows_skipped == 1
+        assert log.where(1998) == f"line {2001 if row < 2000 else 2000}"
+        assert log.where(0) == "line 2"
+
+
+def test_time_that_stays_behind_is_an_error_with_broken_rows_left_out_too():
+    back = T.copy()
+    back[700:] -= 5.0
+    log = opened(text(np.hstack([back, A]), names="t,ax,ay,az"), options=ReadOptions(skip_bad=True))
+    with pytest.raises(DataError, match=r"line 702: time 2 comes after 6.99; expected") as told:
+        read(log)
+    assert "--skip-bad" not in str(told.value)
+
+
+def test_single_falls_are_left_out_across_blocks():
+    """Whatever the blocks, the same rows stay."""
+    rng = np.random.default_rng(5)
+    time = np.arange(400) * 0.01
+    wrong = rng.choice(np.arange(2, 398), 12, replace=False)
+    wrong = wrong[np.abs(np.subtract.outer(wrong, wrong) + 9 * np.eye(12)).min(axis=0) > 3]
+    time[wrong] += rng.choice([-3.0, 3.0], len(wrong))
+
+    class Table:
+        out: list[int]
+
+        def __init__(self):
+            self.out = []
+
+        def leave_out(self, row):
+            self.out.append(row)
+
+    for size in (1, 2, 3, 7, 400):
+        blocks = [
+            RowBlock(k, np.column_stack([np.arange(400.0), time])[k : k + size]) for k in range(0, 400, size)
+        ]
+        table = Table()
+        sound = SoundTimes(table)
+        rows = np.concatenate([block.numbers for block in sound.of(blocks)])
+        assert sorted(table.out) == sorted(wrong)
+        assert [sound.rows.line(k) for k in range(len(rows))] == rows[:, 0].tolist()

@@ -1,4 +1,4 @@
-"""Tables written in any dialect read back as the same numbers."""
+"""Tables written in any dialect, below any preamble, read back as the same numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import sniff
-from accelcal_cli.io.readings import read_readings
+from accelcal_cli.io.reader import ReadOptions
+from accelcal_cli.io.readings import Readings, read_readings
 
 NUMBERS = st.floats(-1e9, 1e9).map(lambda value: value + 0.0)
 # Rows of zeros are no readings: they are left out.
@@ -106,3 +107,56 @@ def test_the_separator_that_spreadsheets_note_above_a_table_is_no_row(separator,
     lines += [separator.join(map(str, row)) for row in rows]
     (tmp_path / "sheet.csv").write_text("\r\n".join(lines))
     np.testing.assert_array_equal(read_readings(tmp_path / "sheet.csv").output(), rows)
+
+
+POSES = [[round(9.8 * np.cos(k), 3), round(9.8 * np.sin(k), 3), round(0.1 * k + 0.05, 3)] for k in range(14)]
+BODY = "".join(f"{x},{y},{z}\n" for x, y, z in POSES)
+
+
+def read(text: str, **options: object) -> Readings:
+    return read_readings("-", stdin=io.BytesIO(text.encode()), options=ReadOptions(**options))
+
+
+@pytest.mark.parametrize(
+    "above",
+    [
+        "ax,ay,az\n",
+        "ax,ay,az\nm/s^2,m/s^2,m/s^2\n",
+        "Device: A\nSerial Number: 17\n\nax,ay,az\n",
+        "----\nRate 50 Hz\n----\nax,ay,az\n[m/s2],[m/s2],[m/s2]\n",
+        '"Product","Logger"\n"acc_1G","2048"\n"ax","ay","az"\n',
+        "// by hand\n% twice\n; and again\nax,ay,az\n",
+        "# ax,ay,az\n",
+        "// a note\n# ax, ay, az\n",
+        "Logger 7\nax;ay;az\n",
+        "100\nax,ay,az\n",
+        "1544027283.0,1544027283.0,1544027283.0\n32.0,32.0,32.0\n",
+        "Accelerometer,,\nx,y,z\n",
+    ],
+)
+def test_what_stands_above_a_table_is_no_row(above: str) -> None:
+    np.testing.assert_array_equal(read(above + BODY).output(), POSES)
+
+
+def test_a_note_says_what_was_skipped_and_used() -> None:
+    readings = read("Logger 7\nSerial Number: AB12\nSample rate: 50 Hz\nax,ay,az\n" + BODY)
+    assert "3 lines above the table skipped: rate 50 Hz, serial number AB12" in readings.notes
+
+
+def test_a_broken_first_row_is_no_preamble() -> None:
+    assert sniff(("1,2\n" + BODY).encode(), "f").first == ("1", "2")
+    with pytest.raises(DataError, match="line 2: has 2 cells where the header has 3"):
+        read("ax,ay,az\n1,2\n" + BODY)
+
+
+def test_numbers_above_columns_are_no_pose() -> None:
+    rows = "".join(f"{100 * k},{200 - k},{16384 - k}\n" for k in range(12))
+    assert read("0,1,2\n" + rows).poses == 12
+    assert read("1,2,3\n" + rows).poses == 12
+    assert read("0,1,2\n3,4,5\n7,8,9\n").poses == 3
+
+
+def test_lines_to_skip_may_be_stated() -> None:
+    readings = read("1,2,3\n4,5,6\nax,ay,az\n" + BODY, skip_rows=2)
+    np.testing.assert_array_equal(readings.output(), POSES)
+    assert "the first 2 lines skipped (--skip-rows)" in readings.notes

@@ -1,16 +1,18 @@
-"""The fast parser means what the careful parser means: same numbers, same lines, same errors."""
+"""The fast parser means what the careful parser means: same numbers, same lines, same errors; what is no row."""
 
 from __future__ import annotations
 
 import io
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import Dialect
-from accelcal_cli.io.reader import CarefulParser, FastParser, Selection
+from accelcal_cli.io.reader import CarefulParser, FastParser, ReadOptions, Selection
+from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.io.stream import ByteSource
 
 ODD_CELLS = [
@@ -164,3 +166,59 @@ def test_other_columns_take_the_fast_path_too() -> None:
     rows = FastParser(careful).parse('état,2.5,üp side\n"a b","2.5","üp side"\n'.encode() * 50)
     assert rows.numbers.tolist() == [[2.5]] * 100
     assert rows.texts == (["üp side"] * 100,)
+
+
+ROWS = [[round(9.8 * np.cos(k), 3), round(9.8 * np.sin(k), 3), round(0.1 * k + 0.05, 3)] for k in range(14)]
+BODY = "".join(f"{x},{y},{z}\n" for x, y, z in ROWS)
+
+
+def read(text: str, **options: object) -> Readings:
+    return read_readings("-", stdin=io.BytesIO(text.encode()), options=ReadOptions(**options))
+
+
+def test_broken_rows_are_left_out_on_request() -> None:
+    many = "ax,ay,az\n" + BODY * 4
+    broken = many.replace("\n", "\n1,2-3,4\n", 1)
+    with pytest.raises(DataError, match='line 2, column "ay": "2-3" is not a number; --skip-bad leaves out'):
+        read(broken)
+    readings = read(broken, skip_bad=True)
+    assert "1 broken row left out (--skip-bad): line 2" in readings.notes
+    assert (readings.form.rows, readings.form.rows_skipped) == (56, 1)
+    with pytest.raises(DataError, match=r"4 of 60 rows are broken, more than the 5% .*lines 2, 3, 4, 5"):
+        read(many.replace("\n", "\n" + "1,x,4\n" * 4, 1), skip_bad=True)
+
+
+def test_a_cut_last_line_is_forgiven() -> None:
+    readings = read("ax,ay,az\n" + BODY + "1.5,2")
+    assert readings.poses == len(ROWS)
+    assert "the last line, 16, left out: it is cut off" in readings.notes
+    with pytest.raises(DataError, match="line 16: has 2 cells"):
+        read("ax,ay,az\n" + BODY + "1.5,2\n")
+
+
+def test_a_repeated_header_and_rows_of_other_sensors_are_no_readings() -> None:
+    again = read("ax,ay,az\n" + BODY + "ax,ay,az\n" + BODY)
+    assert again.poses == 2 * len(ROWS)
+    assert any("header is repeated" in note for note in again.notes)
+    merged = "ax,ay,az,alt\n" + "".join(f"{x},{y},{z},\n,,,12\n" for x, y, z in ROWS)
+    np.testing.assert_array_equal(read(merged).output(), ROWS)
+
+
+@pytest.mark.parametrize(
+    ("line", "seen"),
+    [
+        ("nan,1,2", "is not a finite number"),
+        ("1,2", "has 2 cells"),
+        ("1,,3", "is empty"),
+        ('1,"2,3', "quotation mark"),
+    ],
+)
+def test_a_refusal_names_the_option_that_helps(line: str, seen: str) -> None:
+    lines = BODY * 40
+    with pytest.raises(DataError, match=f"line 5[,:].*{seen}.*; --skip-bad leaves out broken rows$"):
+        read("ax,ay,az\n" + lines.replace("\n", f"\n{line}\n", 3).replace(f"{line}\n", "", 2))
+    with pytest.raises(
+        DataError, match=f"line 2[,:].*{seen}"
+    ) as told:  # every third row: the option would not help
+        read("ax,ay,az\n" + f"{line}\n1,2,3\n3,2,1\n" * 30)
+    assert "--skip-bad" not in str(told.value)
