@@ -133,7 +133,7 @@ def _all():
         *_screened_log(),
         *(n for loss in ("plain", "robust", "known") for n in assess.not_fitting(["line 2"], 15, loss)),
         *assess.large_residuals(1.0, G, 100),
-        *assess.more_than_noise(9.0, 1e-9),
+        *(n for freedom in (3, 15) for n in assess.more_than_noise(9.0, 1e-9, freedom)),
         *assess.odd_gravity(98.0),
         assess.PERPENDICULAR,
         assess.WALLED,
