@@ -76,8 +76,11 @@ MATTERS = 0.3
 LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
 """Residuals of at most this part of the noise that the scatter predicts, and by chance this rarely, are told of."""
 
-SURELY_PATTERN = 5e-4
-"""Chance of a pattern in the residuals below which it is told of."""
+SURELY_PATTERN, LIKELY_PATTERN = 5e-4, 0.01
+"""Chance of a pattern in the residuals below which it is told of, and where they are surely more than noise."""
+
+FEW_TO_JUDGE = 3
+"""Degrees of freedom up to which residuals do not tell a pattern from what is random."""
 
 CHECKABLE, FEW_TO_CHECK = 0.9, 3
 """Leverage up to which a pose is checked by the others, and the degrees of freedom up to which that is asked: beyond
@@ -135,9 +138,10 @@ def assess(fit: Fit) -> Assessment:
     outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
     left, (bent, drift) = _to_gain(fit), fit.patterns
-    patterned = (bent < SURELY_PATTERN) | (drift < SURELY_PATTERN)
+    limit = np.where(_are_more_than_noise(fit), LIKELY_PATTERN, SURELY_PATTERN)
+    patterned = (bent < limit) | (drift < limit)
     for at in np.flatnonzero(_may_have_warnings(fit, left) | patterned).tolist():
-        own = _patterns_in_words(float(bent[at]), float(drift[at]))
+        own = _patterns_in_words(float(bent[at]), float(drift[at]), float(limit[at]))
         warnings[at] = (*_warnings(fit, at, float(left[at]), outliers[at]), *own)
     verdicts = [_verdict(word, said) for word, said in zip(geometry, warnings, strict=True)]
     return Assessment(fit, verdicts, reasons, suggestions, warnings, outliers)
@@ -250,14 +254,19 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
 
-def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:
-    """Return warnings of patterns in the residuals, by their p-values."""
+def _are_more_than_noise(fit: Fit) -> Bool:
+    """Return whose residuals are surely more than what the scatter within the poses predicts, shape (R,)."""
+    return np.asarray((fit.spread.ratio >= MORE_THAN_NOISE) & (fit.spread.p_more <= SURELY))
+
+
+def _patterns_in_words(bent: float, drift: float, limit: float) -> tuple[Notice, ...]:
+    """Return warnings of patterns in the residuals, by their p-values and the limit of these."""
     notices = []
-    if drift < SURELY_PATTERN:
+    if drift < limit:
         text = f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
         remedy = "Let the sensor warm up first, or add a column of temperatures."
         notices.append(Notice("residuals", "warning", text, remedy))
-    if bent < SURELY_PATTERN:
+    if bent < limit:
         text = f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
         remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
         notices.append(Notice("residuals", "warning", text, remedy))
@@ -290,7 +299,7 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         *((WALLED,) if walled else ()),
         *lines,
         *_against_labels(fit, at),
-        *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at])),
+        *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at]), freedom),
         *_less_than_noise(fit, at),
         *_noise_bias(fit, at),
         *_tremor(fit, at),
@@ -471,17 +480,23 @@ def _listed(poses: Sequence[str]) -> str:
     return ", ".join(poses[:MOST_NAMED]) + more
 
 
-def more_than_noise(ratio: float, chance: float) -> tuple[Notice, ...]:
-    """Return a note of residuals of so many times the noise that the scatter predicts, and its p-value.
+def more_than_noise(ratio: float, chance: float, freedom: int) -> tuple[Notice, ...]:
+    """Return what is said of residuals of so many times the noise that the scatter predicts, and its p-value.
 
-    Sigma counts them: what moves the poses at random is in the intervals.
+    Sigma counts them: what moves the poses at random is in the intervals. With few degrees of freedom nothing tells
+    that from an error that goes with the direction, which biases the parameters.
     """
     if not (ratio >= MORE_THAN_NOISE and chance <= SURELY):
         return ()
     text = (
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
-        "moved in them, changed its temperature or is not linear. Sigma counts that as noise."
+        "moved in them, changed its temperature or is not linear."
     )
+    if freedom <= FEW_TO_JUDGE:
+        text += f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
+        remedy = "Take 18 poses or more, faces among them, and let the sensor warm up first."
+        return (Notice("residuals", "warning", text, remedy),)
+    text += " Sigma counts that as noise."
     remedy = "Let the sensor warm up, fix it in each pose, or add a column of temperatures."
     return (Notice("residuals", "note", text, remedy),)
 

@@ -277,6 +277,9 @@ JUMP = 5.0
 MOST_CLUSTERS, FEWEST_CLUSTERS = 2048, 16
 """Clusters that are held, and the fewest that adjacent ones are merged into."""
 
+FEWEST_JUMPS = 8
+"""Jumps of the attitude from which on what is between them is a pose, and rows of one pose are not independent."""
+
 
 @dataclass(frozen=True, eq=False)
 class NoiseSpread:
@@ -453,7 +456,7 @@ class Clusters:
     @classmethod
     def of(cls, rows: int, jumps: int) -> Clusters:
         """Return clusters for so many rows: the attitudes where they jump often enough, else blocks of time."""
-        return cls(rows if jumps >= FEWEST_CLUSTERS else -(-2 * rows // MOST_CLUSTERS))
+        return cls(rows if jumps >= FEWEST_JUMPS else -(-2 * rows // MOST_CLUSTERS))
 
     def add(self, u: Float, scaled: Float, w: Float) -> None:
         """Add rows: unit directions, shape (B, 3), sqrt(w) e and w, shape (B,)."""

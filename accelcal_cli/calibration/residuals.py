@@ -199,14 +199,16 @@ FEWEST_SPARE = 3
 def bend_and_drift(residuals: PoseResiduals, poses: Int, g: float) -> tuple[Float, Float]:
     """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
 
-    A quadratic and a cubic term of each axis; a bias that changes evenly from the first pose to the last.
+    A quadratic or a cubic term of each axis, or both; a bias that changes evenly from the first pose to the last.
 
     Args:
         residuals: of all poses; poses: J of each sensor, shape (R,); g: m/s^2.
     """
     u = unit(residuals.force)
     time = (residuals.pose / np.maximum(poses[:, None] - 1, 1))[..., None]
-    bent = pattern_chance(residuals, np.concatenate([u**3, u**4], axis=2), g)
+    kinds = (u**3, u**4, np.concatenate([u**3, u**4], axis=2))
+    chances = np.stack([pattern_chance(residuals, columns, g) for columns in kinds])
+    bent = np.minimum(len(kinds) * np.fmin.reduce(chances), 1.0)  # Bonferroni
     return bent, pattern_chance(residuals, time * u, g)
 
 

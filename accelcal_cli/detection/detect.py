@@ -30,7 +30,7 @@ from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, read_tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import InputForm, Readings
-from accelcal_cli.io.screening import LOOKED_AT, Screened
+from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
@@ -100,6 +100,7 @@ class Detection:
         form: of the file.
         envelope: of the log, for a picture; None unless asked for.
         warnings: what the rows show that is no rest.
+        behind: the first rows of acceleration and the extremes of all, sensor units; None where they are not known.
     """
 
     source: str
@@ -117,6 +118,7 @@ class Detection:
     form: InputForm
     envelope: Envelope | None = None
     warnings: tuple[Notice, ...] = ()
+    behind: Behind | None = None
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
@@ -134,6 +136,7 @@ class Detection:
             warm=readings.temperature is not None,
             count=intervals.n[first].astype(float),
             scatter=intervals.scatter[first],
+            behind=self.behind,
         )
         more = [notice for notice in screened.notices() if notice.key not in said]
         return readings.known_as(
@@ -175,7 +178,8 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     rate = settings.rate if settings.rate is not None else log.clock.rate
     lengths = settings.spans.rows(rate)
     envelope = Envelope(lengths.tile) if picture else None
-    in_turn = alternating(*_parted(log))
+    head, times = _parted(log)
+    in_turn = alternating(head, times)
     tiles = read_tiles(log, lengths, envelope)
     level, lively = _screened(tiles, lengths, log)
     segmentations = find_intervals(tiles, lengths, level, settings.multipliers)
@@ -207,10 +211,12 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         form=replace(log.form, rows=tiles.rows, rate_hz=rate),
         warnings=warnings,
         envelope=envelope,
+        behind=Behind(head, tiles.low, tiles.high),
     )
     if not enough:
         why = explain_too_few(segmentations[kept], candidates[kept], detection)
-        raise TooFewPosesError("; ".join([f"{log.name}: {why}", *gaps]), detection)
+        seen = [notice.text.rstrip(".") for notice in warnings]
+        raise TooFewPosesError("; ".join([f"{log.name}: {why}", *seen, *gaps]), detection)
     return detection
 
 

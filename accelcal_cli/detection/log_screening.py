@@ -21,7 +21,7 @@ from accelcal_cli.detection.intervals import ROUNDING, Intervals, StillLevel
 from accelcal_cli.detection.windows import Tiles, Windows
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.rows import SHOWN, named
-from accelcal_cli.io.screening import bits_of_rail
+from accelcal_cli.io.ties import bits_of_rail
 from accelcal_cli.notices import Notice
 
 LONG = 5

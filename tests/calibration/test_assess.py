@@ -206,8 +206,10 @@ def test_the_noise_of_forty_clean_sets_is_not_told_of():
     [(1.9, 1e-9, False), (2.1, 1e-9, True), (5.0, 2e-3, False), (5.0, 5e-4, True), (np.nan, np.nan, False)],
 )
 def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio, chance, told):
-    said = assess.more_than_noise(ratio, chance)
-    assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
+    for freedom, severity in ((3, "warning"), (4, "note")):
+        said = assess.more_than_noise(ratio, chance, freedom)
+        assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
+        assert {line.severity for line in said} <= {severity}
 
 
 @pytest.mark.parametrize("part", [0.01, 0.03])
