@@ -24,11 +24,11 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
-from accelcal_cli.calibration.sample import NO_NOISE
+from accelcal_cli.calibration.sample import NO_NOISE, axis_up
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.notices import Notice, Severity, are_serious
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
-from accelcal_cli.sensor.poses import AXES, axis_up
+from accelcal_cli.sensor.poses import AXES
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -493,7 +493,9 @@ def more_than_noise(ratio: float, chance: float, freedom: int) -> tuple[Notice, 
         "moved in them, changed its temperature or is not linear."
     )
     if freedom <= FEW_TO_JUDGE:
-        text += f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
+        text += (
+            f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
+        )
         remedy = "Take 18 poses or more, faces among them, and let the sensor warm up first."
         return (Notice("residuals", "warning", text, remedy),)
     text += " Sigma counts that as noise."

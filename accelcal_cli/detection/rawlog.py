@@ -22,6 +22,7 @@ from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, Selection, op
 from accelcal_cli.io.readings import InputForm
 from accelcal_cli.io.rows import MOST_SENSORS, SKIPPABLE, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.vocabulary import parse_unit
+from accelcal_cli.notices import Notice
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
@@ -218,6 +219,10 @@ class RawLog:
         return np.concatenate([np.empty((0, width)), *(rows.numbers[:, :width] for rows in self._head)])[
             :HEAD
         ]
+
+    def zero_rows(self, rows: int) -> tuple[Notice, ...]:
+        """Return what is said of rows of zeros among so many rows that were read."""
+        return self.zeros.notices(self.where, rows - self.zeros.count)
 
     def close(self) -> None:
         """Release the file."""

@@ -105,6 +105,12 @@ class Dialect:
         """What a line of comment begins with."""
         return MARKS if self.separator == ";" else (*MARKS, ";")
 
+    def notes(self) -> list[str]:
+        """Say what stands above the table and was understood of it, if anything does."""
+        above, facts = self.above, str(self.facts)
+        skipped = f"{above:,} line{'s' * (above != 1)} above the table skipped" if above else "comments"
+        return [skipped + f": {facts}" * bool(facts)] if above or facts else []
+
 
 @dataclass(frozen=True)
 class Layout:

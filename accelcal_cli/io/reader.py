@@ -214,16 +214,10 @@ class TextTable:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped, in sentences; complete once all blocks have been read."""
-        above, facts = self.dialect.above, str(self.facts)
         notes = [f"read as {' in '.join(reversed(self._source.forms))}"] * bool(self._source.forms)
         if self._options.skip_rows:
             notes.append(f"the first {self._options.skip_rows:,} lines skipped (--skip-rows)")
-        if above or facts:
-            plural = "s" * (above != 1)
-            notes.append(
-                (f"{above:,} line{plural} above the table skipped" if above else "comments")
-                + f": {facts}" * bool(facts)
-            )
+        notes += self.dialect.notes()
         if self._words is not None and (note := self._words.note()):
             notes.append(note)
         return (*notes, *self.passed.notes())
