@@ -21,6 +21,7 @@ from accelcal_cli.calibration.observability import (
     SCALE,
     PoseVerdict,
     poses_to_add,
+    unit,
 )
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
@@ -78,9 +79,6 @@ LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
 
 SURELY_PATTERN, LIKELY_PATTERN = 5e-4, 0.01
 """Chance of a pattern in the residuals below which it is told of, and where they are surely more than noise."""
-
-FEW_TO_JUDGE = 3
-"""Degrees of freedom up to which residuals do not tell a pattern from what is random."""
 
 CHECKABLE, FEW_TO_CHECK = 0.9, 3
 """Leverage up to which a pose is checked by the others, and the degrees of freedom up to which that is asked: beyond
@@ -249,7 +247,7 @@ def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
-    always |= settings.nominal is not None
+    always |= settings.nominal is not None or fit.sample.temperature is not None
     always |= fit.solution is not None and fit.solution.stated.tremor is not None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
@@ -271,6 +269,22 @@ def _patterns_in_words(bent: float, drift: float, limit: float) -> tuple[Notice,
         remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
         notices.append(Notice("residuals", "warning", text, remedy))
     return tuple(notices)
+
+
+def _drift(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a warning of temperatures that are not used although a drift with them may bias the parameters."""
+    degrees, residuals, solution = fit.sample.temperature, fit.residuals, fit.solution
+    if degrees is None or solution is None or solution.slopes is not None or not fit.settings.temperature:
+        return ()
+    warmth, weight = degrees[at, residuals.pose[at]], residuals.weight[at]
+    if not np.isfinite(warmth).all() or residuals.pose.shape[1] < int(fit.sample.poses[at]):
+        return ()
+    from accelcal_cli.calibration.temperature import drift_unseen
+
+    more = bool(_are_more_than_noise(fit)[at])
+    return drift_unseen(
+        unit(residuals.force[at]), weight, warmth, float(fit.s[at]), fit.settings.g, shown=more
+    )
 
 
 def _fewest_attitudes(fit: Fit) -> int:
@@ -304,6 +318,7 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         *_noise_bias(fit, at),
         *_tremor(fit, at),
         *_correlated(fit, at),
+        *_drift(fit, at),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),
         *odd_gravity(settings.g),
@@ -492,8 +507,10 @@ def more_than_noise(ratio: float, chance: float, freedom: int) -> tuple[Notice, 
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
         "moved in them, changed its temperature or is not linear."
     )
-    if freedom <= FEW_TO_JUDGE:
-        text += f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
+    if freedom <= FEW_TO_CHECK:
+        text += (
+            f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
+        )
         remedy = "Take 18 poses or more, faces among them, and let the sensor warm up first."
         return (Notice("residuals", "warning", text, remedy),)
     text += " Sigma counts that as noise."
