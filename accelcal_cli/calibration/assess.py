@@ -146,9 +146,13 @@ def assess(fit: Fit) -> Assessment:
 
 
 def _unchecked(fit: Fit) -> Bool:
-    """Return which of the kept poses no other checks, of few without scatter, shape (R, k)."""
+    """Return which of the kept poses no other checks, of few whose scatter does not bear them out, shape (R, k)."""
     asked = (fit.freedom >= 1) & (fit.freedom <= FEW_TO_CHECK) & np.isnan(fit.spread.ratio)
     asked &= fit.solution is not None
+    noise = None if fit.solution is None else fit.solution.stated.noise
+    if noise is not None:  # a robust loss has no ratio
+        expected = noise.variance.sum(axis=1) / fit.sample.poses
+        asked &= ~(noise.known & (fit.spread.variance <= MORE_THAN_NOISE**2 * expected))
     return np.asarray((fit.residuals.leverage >= CHECKABLE) & fit.residuals.real & asked[:, None])
 
 
@@ -237,12 +241,8 @@ def _to_gain(fit: Fit) -> Float:
 def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_warnings` has something to say of, or might have, shape (R,)."""
     g, s, settings, spread = fit.settings.g, fit.s, fit.settings, fit.spread
-    noisy = (
-        (s > LARGE * g)
-        | (fit.bias > 0).any(axis=1)
-        | (fit.largest_misalignment > TURNED)
-        | (fit.clusters > 0)
-    )
+    noisy = (s > LARGE * g) | (fit.bias > 0).any(axis=1) | (fit.clusters > 0)
+    noisy |= fit.largest_misalignment > TURNED
     noisy |= (spread.ratio >= MORE_THAN_NOISE) | (spread.ratio <= LESS_THAN_NOISE)
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
@@ -259,16 +259,18 @@ def _are_more_than_noise(fit: Fit) -> Bool:
 
 def _patterns_in_words(bent: float, drift: float, limit: float) -> tuple[Notice, ...]:
     """Return warnings of patterns in the residuals, by their p-values and the limit of these."""
-    notices = []
-    if drift < limit:
-        text = f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
-        remedy = "Let the sensor warm up first, or add a column of temperatures."
-        notices.append(Notice("residuals", "warning", text, remedy))
-    if bent < limit:
-        text = f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
-        remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
-        notices.append(Notice("residuals", "warning", text, remedy))
-    return tuple(notices)
+    drifts = (
+        f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
+    )
+    bends = (
+        f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
+    )
+    warm_up = "Let the sensor warm up first, or add a column of temperatures."
+    again = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
+    found = ((drift, drifts, warm_up), (bent, bends, again))
+    return tuple(
+        Notice("residuals", "warning", text, remedy) for chance, text, remedy in found if chance < limit
+    )
 
 
 def _drift(fit: Fit, at: int) -> tuple[Notice, ...]:
@@ -571,9 +573,7 @@ def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
         return ()
     readings, residuals = fit.sample.readings(at), fit.residuals
     real = residuals.real[at]
-    votes = np.zeros(
-        (3, 2), dtype=int
-    )  # of each axis: labels that the fit bears out, and that it contradicts
+    votes = np.zeros((3, 2), dtype=int)  # of each axis: labels that the fit bears out, and others
     for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
         said = axis_up(readings.where(pose))
         if said is not None:
