@@ -31,7 +31,7 @@ KEYS = {
     *("log", "several-sensors", "duplicate-rows", "zero-rows", "frozen", "clipped", "gravity-removed"),
     *("never-moved", "wrong-gravity", "outliers", "large-misalignment", "residuals", "noise-bias", "tremor"),
     *("correlated", "unequal-noise", "few-attitudes", "box", "thousands", "dead-axis", "unfinished-search"),
-    *("perpendicular", "negative-axes", "legacy", "unit", "suspect-result", "quantised"),
+    *("perpendicular", "negative-axes", "legacy", "unit", "suspect-result", "quantised", "drift"),
 }
 """Those that programs may rely on."""
 
@@ -145,12 +145,19 @@ def _all():
         *calibrate(_means(_rows(0.02)), Settings(g=G, weights="auto")).warnings,
         *calibrate(_means(_rows(0.1)), Settings(g=G, weights="auto")).warnings,
         *calibrate(_means(two), Settings(g=G, weights="auto")).warnings,
+        *calibrate(_warming(), Settings(g=G)).warnings,
         *_calibrated(DPSO.output(G * faces + noise(12, 1e-3, 1))),
         *_calibrated(wrong),
         *_calibrated(DPSO.output(1.01 * u + noise(24, 1e-3, 1)), nominal=Nominal(scale=(5.67e5,) * 3)),
         *_calibrated(DPSO.output(np.tile(u, (500, 1)) + noise(12_000, 0.3, 1))),
         *_calibrated(DPSO.output(np.repeat(u, 100, axis=0) + 0.05 * _creeping(2400))),
     ]
+
+
+def _warming():
+    """Return readings whose temperature goes with their attitudes."""
+    u = poses.directions(14, "fibonacci", np.empty((0, 3)))
+    return Readings.from_array(DPSO.output(G * u + noise(14, 1e-4, 2)), temperature=np.linspace(15, 45, 14))
 
 
 def _of_another_unit():

@@ -21,6 +21,7 @@ from accelcal_cli.calibration.observability import (
     SCALE,
     PoseVerdict,
     poses_to_add,
+    unit,
 )
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
@@ -78,9 +79,6 @@ LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
 
 SURELY_PATTERN, LIKELY_PATTERN = 5e-4, 0.01
 """Chance of a pattern in the residuals below which it is told of, and where they are surely more than noise."""
-
-FEW_TO_JUDGE = 3
-"""Degrees of freedom up to which residuals do not tell a pattern from what is random."""
 
 CHECKABLE, FEW_TO_CHECK = 0.9, 3
 """Leverage up to which a pose is checked by the others, and the degrees of freedom up to which that is asked: beyond
@@ -148,9 +146,13 @@ def assess(fit: Fit) -> Assessment:
 
 
 def _unchecked(fit: Fit) -> Bool:
-    """Return which of the kept poses no other checks, of few without scatter, shape (R, k)."""
+    """Return which of the kept poses no other checks, of few whose scatter does not bear them out, shape (R, k)."""
     asked = (fit.freedom >= 1) & (fit.freedom <= FEW_TO_CHECK) & np.isnan(fit.spread.ratio)
     asked &= fit.solution is not None
+    noise = None if fit.solution is None else fit.solution.stated.noise
+    if noise is not None:  # a robust loss has no ratio
+        expected = noise.variance.sum(axis=1) / fit.sample.poses
+        asked &= ~(noise.known & (fit.spread.variance <= MORE_THAN_NOISE**2 * expected))
     return np.asarray((fit.residuals.leverage >= CHECKABLE) & fit.residuals.real & asked[:, None])
 
 
@@ -239,17 +241,13 @@ def _to_gain(fit: Fit) -> Float:
 def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_warnings` has something to say of, or might have, shape (R,)."""
     g, s, settings, spread = fit.settings.g, fit.s, fit.settings, fit.spread
-    noisy = (
-        (s > LARGE * g)
-        | (fit.bias > 0).any(axis=1)
-        | (fit.largest_misalignment > TURNED)
-        | (fit.clusters > 0)
-    )
+    noisy = (s > LARGE * g) | (fit.bias > 0).any(axis=1) | (fit.clusters > 0)
+    noisy |= fit.largest_misalignment > TURNED
     noisy |= (spread.ratio >= MORE_THAN_NOISE) | (spread.ratio <= LESS_THAN_NOISE)
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
-    always |= settings.nominal is not None
+    always |= settings.nominal is not None or fit.sample.temperature is not None
     always |= fit.solution is not None and fit.solution.stated.tremor is not None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
@@ -261,16 +259,34 @@ def _are_more_than_noise(fit: Fit) -> Bool:
 
 def _patterns_in_words(bent: float, drift: float, limit: float) -> tuple[Notice, ...]:
     """Return warnings of patterns in the residuals, by their p-values and the limit of these."""
-    notices = []
-    if drift < limit:
-        text = f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
-        remedy = "Let the sensor warm up first, or add a column of temperatures."
-        notices.append(Notice("residuals", "warning", text, remedy))
-    if bent < limit:
-        text = f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
-        remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
-        notices.append(Notice("residuals", "warning", text, remedy))
-    return tuple(notices)
+    drifts = (
+        f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
+    )
+    bends = (
+        f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
+    )
+    warm_up = "Let the sensor warm up first, or add a column of temperatures."
+    again = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
+    found = ((drift, drifts, warm_up), (bent, bends, again))
+    return tuple(
+        Notice("residuals", "warning", text, remedy) for chance, text, remedy in found if chance < limit
+    )
+
+
+def _drift(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a warning of temperatures that are not used although a drift with them may bias the parameters."""
+    degrees, residuals, solution = fit.sample.temperature, fit.residuals, fit.solution
+    if degrees is None or solution is None or solution.slopes is not None or not fit.settings.temperature:
+        return ()
+    warmth, weight = degrees[at, residuals.pose[at]], residuals.weight[at]
+    if not np.isfinite(warmth).all() or residuals.pose.shape[1] < int(fit.sample.poses[at]):
+        return ()
+    from accelcal_cli.calibration.temperature import drift_unseen
+
+    more = bool(_are_more_than_noise(fit)[at])
+    return drift_unseen(
+        unit(residuals.force[at]), weight, warmth, float(fit.s[at]), fit.settings.g, shown=more
+    )
 
 
 def _fewest_attitudes(fit: Fit) -> int:
@@ -304,6 +320,7 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         *_noise_bias(fit, at),
         *_tremor(fit, at),
         *_correlated(fit, at),
+        *_drift(fit, at),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),
         *odd_gravity(settings.g),
@@ -492,7 +509,7 @@ def more_than_noise(ratio: float, chance: float, freedom: int) -> tuple[Notice, 
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
         "moved in them, changed its temperature or is not linear."
     )
-    if freedom <= FEW_TO_JUDGE:
+    if freedom <= FEW_TO_CHECK:
         text += (
             f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
         )
@@ -556,9 +573,7 @@ def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
         return ()
     readings, residuals = fit.sample.readings(at), fit.residuals
     real = residuals.real[at]
-    votes = np.zeros(
-        (3, 2), dtype=int
-    )  # of each axis: labels that the fit bears out, and that it contradicts
+    votes = np.zeros((3, 2), dtype=int)  # of each axis: labels that the fit bears out, and others
     for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
         said = axis_up(readings.where(pose))
         if said is not None:

@@ -98,12 +98,16 @@ class Liveliness:
         return cls(lively, number, tuple(parts[worst]) if number else (), tiles.low, tiles.high)
 
     def unusable(self, tiles: Tiles) -> Callable[[Float], Bool]:
-        """Return what tells the tiles of a block that are no readings: zeros, and what is frozen."""
+        """Return what tells the tiles of a block that are no readings: zeros, and what is frozen for LONG.
+
+        A few rows may be equal by chance, and must not end a pose.
+        """
 
         def of(block: Float) -> Bool:
             bad = (block[:, :6] == 0).all(axis=1)
             for i in np.flatnonzero(self.axes).tolist():
-                bad |= _is_flat(tiles, block, i)
+                for a, b in _runs(_is_flat(tiles, block, i)):
+                    bad[a:b] = True
             return np.asarray(bad)
 
         return of

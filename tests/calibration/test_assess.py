@@ -243,3 +243,16 @@ def test_poses_that_stand_in_for_each_other_are_said_to():
     )
     assert "pose 5" in notice.text
     assert notice.text.endswith("With so few poses one can take the blame of another.")
+
+
+def test_scatter_checks_the_poses_of_a_robust_fit_of_twelve():
+    """Three degrees of freedom and a pose of large leverage: residuals that agree with the scatter bear it out."""
+    u = poses.edges() + 0.14 * noise(12, 1.0, 32)
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    settings = Settings(g=G, optimizer="levenberg-marquardt", robust="huber")
+    output = DPSO.output(G * u + noise(12, 1e-3, 8))
+    alone = calibrate(Readings.from_array(output), settings)
+    assert max(pose.leverage for pose in alone.poses_fit) > 0.9
+    assert alone.verdict == "weak"
+    spread = np.abs(np.diagonal(DPSO.K)) * np.full((12, 3), 1e-2)
+    assert calibrate(Readings.from_array(output, count=np.full(12, 100), scatter=spread), settings).verdict == "good"

@@ -89,6 +89,16 @@ def test_a_frozen_axis_is_no_rest(log):
     assert len(found.intervals) == 13
 
 
+def test_steps_near_the_noise_do_not_end_poses():
+    """Of five rows with a noise of 0.8 steps now and then all are equal."""
+    numbers, holds = simulated(14, seed=4, gyro=False, timed=False)
+    still = np.concatenate([numbers[a - 1 : b] - numbers[a - 1 : b].mean(axis=0) for a, b in holds])
+    step = float(still.std()) / 0.8
+    found = detected(step * np.round(numbers / step))
+    assert keys(found) == {}
+    assert len(found.intervals) == 14
+
+
 def test_coarse_readings_are_not_frozen(log):
     rows = 400 * np.round(log[0] / 400)
     found = keys(detected(rows))
