@@ -204,6 +204,9 @@ def bend_and_drift(residuals: PoseResiduals, poses: Int, g: float) -> tuple[Floa
     Args:
         residuals: of all poses; poses: J of each sensor, shape (R,); g: m/s^2.
     """
+    spare = np.count_nonzero(residuals.weight, axis=1) - 9 - 3
+    if spare.max() < FEWEST_SPARE:
+        return np.full(len(spare), np.nan), np.full(len(spare), np.nan)
     e, rows, cofactor = _linearised(residuals.force, residuals.weight, g, np.arange(9))
     u = unit(residuals.force)
     time = (residuals.pose / np.maximum(poses[:, None] - 1, 1))[..., None]
