@@ -29,7 +29,7 @@ from accelcal_cli.io.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from accelcal_cli.io.lines import LineFilter
+    from accelcal_cli.io.lines import LineFilter, MessageFilter
 
 SAMPLE = 1000
 """Content lines that the dialect is found from."""
@@ -41,6 +41,9 @@ MARKS = ("#", "//", "%")
 """What a line of comment begins with."""
 
 BOM = b"\xef\xbb\xbf"
+
+OPENING = 1 << 16
+"""Bytes in which an ArduPilot log says what its messages are."""
 
 TAIL = 64
 """Last lines of a sample by which rows are known: what stands above a table is no longer among them."""
@@ -146,9 +149,20 @@ def looks_numeric(cell: str, decimal_comma: bool = True) -> bool:
     return True
 
 
+def to_number(cell: str, decimal_comma: bool) -> float | None:
+    """Return the value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
+    thousands = decimal_comma and "." in cell  # 1.234,5 and 1.234
+    if thousands or "_" in cell or not cell.isascii():
+        return None
+    try:
+        return float(cell.replace(",", ".", 1) if decimal_comma else cell)
+    except ValueError:
+        return None
+
+
 def understand(
     head: bytes, source: str, skip: int = 0, prefix: str | None = None
-) -> tuple[LineFilter | None, Dialect]:
+) -> tuple[LineFilter | MessageFilter | None, Dialect]:
     """Return the dialect of a text, and the filter of its lines where its numbers stand among words.
 
     Args:
@@ -158,6 +172,8 @@ def understand(
     Raises:
         DataError: neither a table nor lines of readings.
     """
+    if b"FMT," in head[:OPENING] and (found := _of_messages(head, source, prefix)):
+        return found
     dialect: Dialect | None = None
     fault: DataError | None = None
     if prefix is None:
@@ -172,16 +188,28 @@ def understand(
     from accelcal_cli.io.lines import find_filter  # most texts have no words between their numbers
 
     lines = head[: 1 << 18].decode(errors="replace").splitlines()[skip:]
-    found = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
-    if found is None:
+    words = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
+    if words is None:
         if dialect is None:
             raise fault or DataError(f"{source}: no line has three numbers; readings were expected")
         return None, dialect
-    dialect = sniff(found.translate(head), source, skip)
-    units = found.kind.units if any(found.kind.units) else None
-    if found.kind.names is not None:
-        dialect = replace(dialect, names=found.kind.names, header_line=0)
-    return found, replace(dialect, units=units, above=0)
+    dialect = sniff(words.translate(head), source, skip)
+    units = words.kind.units if any(words.kind.units) else None
+    if words.kind.names is not None:
+        dialect = replace(dialect, names=words.kind.names, header_line=0)
+    return words, replace(dialect, units=units, above=0)
+
+
+def _of_messages(head: bytes, source: str, wanted: str | None) -> tuple[MessageFilter, Dialect] | None:
+    """Return filter and dialect of an ArduPilot log, None for any other text."""
+    from accelcal_cli.io.lines import find_messages
+
+    messages = find_messages(head, source, wanted)
+    if messages is None:
+        return None
+    rows = (line for line in messages.translate(head).splitlines() if line.strip())
+    first = split_cells(next(rows, b"").decode(errors="replace"), ",")
+    return messages, Dialect(",", False, messages.columns, 0, tuple(first), units=messages.units)
 
 
 def _is_worded(dialect: Dialect) -> bool:

@@ -1,7 +1,8 @@
 """Lines of words and numbers, as sketches print them: ``AcX = 12 | AcY = -5``, ``Raw: 1, 2, 3``, ``#A-R=1,2,3``.
 
-Lines are of one kind when nothing but their numbers differs. `choose_kind` finds the kind that holds acceleration among
-those of a sample, and `LineKind.row` its numbers in a line; files and live streams use the same.
+Lines are of one kind when nothing but their numbers differs. `find_filter` finds the kind that holds acceleration among
+those of a sample, and `LineKind.row` its numbers in a line; files and live streams use the same. The text logs of
+ArduPilot say themselves, in their FMT lines, what the numbers of each kind are (`find_messages`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
@@ -22,6 +24,23 @@ SHOWN = 5
 COLUMNS_OF_NINE = ("ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz")
 """What nine numbers behind one word are, as in the ``Raw:`` lines that MotionCal reads."""
 
+MESSAGES = ("IMU", "ACC")
+"""Messages of ArduPilot that are taken first, in this order."""
+
+FORCE_COLUMNS = ("AccX", "AccY", "AccZ")
+
+MESSAGE_UNITS = {
+    "TimeUS": "us",
+    "SampleUS": "us",
+    "TimeMS": "ms",
+    "T": "degC",
+    "Temp": "degC",
+    **dict.fromkeys(FORCE_COLUMNS, "m/s^2"),
+    **dict.fromkeys(("GyrX", "GyrY", "GyrZ"), "rad/s"),
+}
+"""Units of the columns of ArduPilot's messages of inertial sensors."""
+
+_FORMAT = re.compile(rb"^FMT,\s*\d+,\s*\d+,\s*(\w+),\s*\w*,(.*)$", re.MULTILINE)
 _VALUE = re.compile(
     r"(?P<clock>(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?![\w:]))"
     r"|(?P<number>(?<![\w.^/])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"
@@ -84,6 +103,7 @@ class LineFilter:
     kind: LineKind
     kinds: tuple[LineKind, ...]
     prefix: str = ""
+    form: ClassVar[str] = "words"
 
     def translate(self, block: bytes) -> bytes:
         """Return a block of lines as rows: one line each, empty where it is of another kind."""
@@ -113,6 +133,66 @@ class LineFilter:
         if values is not None:
             return ",".join(value.replace(",", ".") if ":" in value else value for value in values)
         return rest if self.kind.begins(rest) else ""
+
+
+@dataclass(frozen=True)
+class MessageFilter:
+    """The lines of one message of an ArduPilot log, without its name, as comma-separated rows.
+
+    Attributes:
+        message: its name; columns: as its FMT line names them; others: messages with acceleration that are left out.
+    """
+
+    message: str
+    columns: tuple[str, ...]
+    others: tuple[str, ...] = ()
+    form: ClassVar[str] = "comma"
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the columns, "" where they are unknown."""
+        return tuple(MESSAGE_UNITS.get(name, "") for name in self.columns)
+
+    def translate(self, block: bytes) -> bytes:
+        """Return a block of lines as rows: one line each, empty where it is of another message."""
+        lead = f"{self.message},".encode()
+        lines = block.split(b"\n")
+        return b"\n".join([line[len(lead) :].lstrip() if line.startswith(lead) else b"" for line in lines])
+
+    def note(self) -> str:
+        """Say which message was taken."""
+        others = f", {', '.join(self.others)} left out; --line NAME takes others" if self.others else ""
+        return f"ArduPilot log: message {self.message} taken by its FMT line{others}"
+
+
+def find_messages(head: bytes, source: str, wanted: str | None = None) -> MessageFilter | None:
+    """Return the filter of an ArduPilot log, None for any other text.
+
+    Args:
+        head: first bytes; source: named in messages; wanted: name of the message to take, None to find it.
+
+    Raises:
+        DataError: a log without such a message.
+    """
+    formats = {
+        match[1].decode(): tuple(name.strip() for name in match[2].decode(errors="replace").split(","))
+        for match in _FORMAT.finditer(head)
+    }
+    if not formats:
+        return None
+    able = [name for name, columns in formats.items() if set(FORCE_COLUMNS) <= set(columns)]
+    able = [name for name in able if re.search(rb"^%s," % name.encode(), head, re.MULTILINE)]
+    able.sort(key=lambda name: MESSAGES.index(name) if name in MESSAGES else len(MESSAGES))
+    if wanted is None and not able:
+        raise DataError(
+            f"{source}: is an ArduPilot log without messages of acceleration (IMU or ACC); log them with LOG_BITMASK"
+        )
+    message = able[0] if wanted is None else wanted.strip(" ,")
+    if message not in formats:
+        raise DataError(
+            f'{source}: no FMT line defines a message "{message}" (--line); acceleration is in {" or ".join(able)}'
+        )
+    return MessageFilter(message, formats[message], tuple(name for name in able if name != message))
 
 
 def called(kind: LineKind) -> str:
