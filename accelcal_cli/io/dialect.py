@@ -68,8 +68,8 @@ FEWEST_THOUSANDS = 6
 """Cells such as 33,368 from which on they are thousands, where none says that the comma is a decimal mark."""
 
 
-_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->")
-"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``."""
+_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->|\$[A-Z]+")
+"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``, ``$ACC``."""
 
 
 class ThousandsError(DataError):

@@ -18,6 +18,9 @@ from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
 RARE = 0.02
 """Part of the lines of a sample below which a kind is an accident."""
 
+MOST_WORDED = 0.9
+"""Part of the lines with words and too few numbers from which on they are no table either."""
+
 SHOWN = 5
 """Kinds that a message names at most."""
 
@@ -42,9 +45,13 @@ MESSAGE_UNITS = {
 
 _FORMAT = re.compile(rb"^FMT,\s*\d+,\s*\d+,\s*(\w+),\s*\w*,(.*)$", re.MULTILINE)
 _VALUE = re.compile(
-    r"(?P<clock>(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?![\w:]))"
+    r"(?P<clock>(?<![\w.:])(?:\d{4}[-/]\d\d[-/]\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?!\w|[.:]\d))"
     r"|(?P<number>(?<![\w.^/])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"
 )
+_CLOCK = re.compile(r"\s*((?:\d{4}[-/]\d\d[-/]\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?)(?!\w|[.:]\d)[\s:>-]*")
+"""The time that terminal programs write before each line."""
+
+_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"'>-]+")
 
 
@@ -53,12 +60,14 @@ class LineKind:
     """A kind of line.
 
     Attributes:
-        lead: the words before its first number, by which it is called; words: lower case, between the numbers.
+        lead: the words before its first number; name: these, or those behind a time, by which it is called.
+        words: lower case, between the numbers.
         labels: a name for each number, "" where it has none; units: the unit behind it, "" where there is none.
         share: its part of the sample.
     """
 
     lead: str
+    name: str
     words: tuple[str, ...]
     labels: tuple[str, ...]
     units: tuple[str, ...]
@@ -197,14 +206,17 @@ def find_messages(head: bytes, source: str, wanted: str | None = None) -> Messag
 
 def called(kind: LineKind) -> str:
     """Return how a message names a kind."""
-    lead = kind.lead.strip()
-    return f'"{lead}"' if lead else f"{len(kind.labels)} bare numbers"
+    return f'"{kind.name}"' if kind.name else f"{len(kind.labels)} bare numbers"
 
 
 def without_prefix(line: str, prefix: str) -> str | None:
-    """Return a line without its prefix, None for one that does not begin with it."""
+    """Return a line without its prefix, None for one that does not begin with it, or with a time and then with it."""
     text = line.lstrip()
-    return text[len(prefix) :] if text.startswith(prefix) else None
+    if text.startswith(prefix):
+        return text[len(prefix) :]
+    clock = _CLOCK.match(text)
+    rest = "" if clock is None else text[clock.end() :]
+    return f"{clock[1]} {rest[len(prefix) :]}" if clock is not None and rest.startswith(prefix) else None
 
 
 def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) -> LineFilter | None:
@@ -215,7 +227,7 @@ def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) ->
         prefix: of the lines to take, None for the kind that holds acceleration.
 
     Raises:
-        DataError: no line has the prefix, or several kinds may be acceleration.
+        DataError: no line has the prefix, several kinds may be acceleration, or each axis has a line of its own.
     """
     kept = lines
     if prefix is not None:
@@ -226,7 +238,12 @@ def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) ->
             raise DataError(f'{source}: no line begins with "{prefix}" (--line); there are {found}')
     kinds = _kinds(kept)
     able = [kind for kind in kinds if len(kind.labels) >= 3]
-    if prefix is None and not any(kind.lead.strip() or any(kind.labels) for kind in able):
+    if not able and sum(kind.share for kind in kinds if kind.name) > MOST_WORDED:
+        shown = ", ".join(called(kind) for kind in kinds[:SHOWN])
+        raise DataError(
+            f"{source}: no line has three numbers; lines are of the kinds {shown}; x, y and z have to stand in one line"
+        )
+    if prefix is None and not any(kind.name or any(kind.labels) for kind in able):
         return None
     chosen = [kind for kind in able if kind.acceleration] or able
     if not chosen:
@@ -235,20 +252,21 @@ def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) ->
         shown = " or ".join(called(kind) for kind in chosen[:SHOWN])
         raise DataError(
             f"{source}: lines are of several kinds, and the readings could be {shown}; say which with --line, as in "
-            f'--line "{chosen[0].lead.strip() or "PREFIX"}"'
+            f'--line "{chosen[0].name or "PREFIX"}"'
         )
     return LineFilter(chosen[0], tuple(kinds), prefix or "")
 
 
 def _kinds(lines: Sequence[str]) -> list[LineKind]:
-    """Return the kinds of lines with numbers, the commonest first."""
+    """Return the kinds of lines with numbers, the commonest first, without those that occur once where others recur."""
     counts: dict[tuple[tuple[str, ...], int], tuple[int, str]] = {}
     for line in lines:
         words, values = _parts(line)
         key = tuple(words), len(values)
         if values:
             counts[key] = counts.get(key, (0, line))[0] + 1, counts.get(key, (0, line))[1]
-    least = max(1, RARE * len(lines))
+    often = max((count for count, _ in counts.values()), default=0)
+    least = max(2 if often > 2 else 1, RARE * len(lines))
     return [
         _kind(line, count / len(lines))
         for count, line in sorted(counts.values(), key=lambda item: -item[0])
@@ -259,6 +277,7 @@ def _kinds(lines: Sequence[str]) -> list[LineKind]:
 def _parts(line: str) -> tuple[list[str], list[str]]:
     """Return the words around the numbers of a line, one more than numbers, and the numbers as text."""
     words, values, at = [], [], 0
+    line = _CHECKSUM.sub("", line)
     for match in _VALUE.finditer(line):
         words.append(_normal(line[at : match.start()]))
         values.append(match[0])
@@ -271,6 +290,7 @@ def _normal(text: str) -> str:
 
 
 def _kind(line: str, share: float) -> LineKind:
+    line = _CHECKSUM.sub("", line)
     matches = list(_VALUE.finditer(line))
     labels: list[str] = []
     units: list[str] = []
@@ -292,5 +312,7 @@ def _kind(line: str, share: float) -> LineKind:
         units.append(tail[0] if tail and parse_unit(tail[0]) else "")
     if units and parse_unit(units[-1]) in FORCE_UNITS:  # one unit behind the last number is that of all
         units = [unit or units[-1] for unit in units]
-    lead = line[: matches[0].start()].strip()
-    return LineKind(lead, tuple(_parts(line)[0]), tuple(labels), tuple(units), share)
+    lead = name = line[: matches[0].start()].strip()
+    if not lead and matches[0]["clock"] and len(matches) > 1:
+        name = line[matches[0].end() : matches[1].start()].strip(" \t:>-")
+    return LineKind(lead, name, tuple(_parts(line)[0]), tuple(labels), tuple(units), share)

@@ -13,7 +13,8 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.io.lines import find_filter
+from accelcal_cli.io.lines import LineFilter, find_filter
+from accelcal_cli.io.vocabulary import recognise
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -90,7 +91,7 @@ def _open(name: str, baud: int, timeout: float) -> Serial:
 
 def readings(
     lines: Iterable[bytes],
-    columns: Sequence[int],
+    columns: Sequence[int] | None,
     source: str,
     prefix: str | None = None,
     tell: Callable[[str], None] = lambda _: None,
@@ -100,7 +101,8 @@ def readings(
     Where the first lines are of several kinds, those of acceleration are read, as from files.
 
     Args:
-        lines: as they arrive; columns: which numbers, from 0; source: named in messages.
+        lines: as they arrive; source: named in messages.
+        columns: which numbers, from 0; None for those that their words name, else the first three.
         prefix: what the lines of readings begin with, None to find them by their words.
         tell: is told which kind of lines is taken.
 
@@ -111,6 +113,10 @@ def readings(
     texts = (text for text in texts if text)
     first = list(islice(texts, FIRST))
     kinds = find_filter(first, source, prefix) if prefix is not None or _are_mixed(first) else None
+    if kinds is None and columns is None:
+        kinds = _named(first, source)
+    named = _axes(kinds) if columns is None else None
+    columns = columns or range(3)
     if kinds is not None and (note := kinds.note()):
         tell(f"{source}: {note}")
     unread = 0
@@ -121,7 +127,8 @@ def readings(
                 unread += 1
                 _check_unread(unread, source, columns, text)
                 continue
-            text = " ".join(value for value in values if ":" not in value)
+            chosen = values if named is None else [values[k] for k in named]
+            text = " ".join(value for value in chosen if ":" not in value)
         elif text.startswith("#"):
             continue
         else:
@@ -135,9 +142,27 @@ def readings(
 
 def _are_mixed(lines: Sequence[str]) -> bool:
     """Return whether words at their beginning tell lines of several kinds apart, or all seem to be comments."""
-    found = [line for line in lines if _LEAD.match(line)]
+    bare = (_CLOCK.sub("", line).lstrip() for line in lines)
+    found = [line for line in bare if _LEAD.match(line)]
     leads = {_LEAD.match(line)[0] for line in found}  # type: ignore[index]
     return len(leads) > 1 or (bool(found) and all(line.startswith("#") for line in lines))
+
+
+def _named(lines: Sequence[str], source: str) -> LineFilter | None:
+    """Return the kind of lines whose words name x, y, z, None where there is none."""
+    with suppress(DataError):  # then they are read as numbers in a row
+        kinds = find_filter(lines, source)
+        return kinds if _axes(kinds) else None
+    return None
+
+
+def _axes(kinds: LineFilter | None) -> Sequence[int] | None:
+    """Return which numbers of a line are acceleration by their names, None where these do not say."""
+    if kinds is None or kinds.kind.names is None:
+        return None
+    roles = recognise(kinds.kind.names)
+    families = list((roles.families or roles.described).values())
+    return families[0] if len(families) == 1 else None
 
 
 def _check_unread(unread: int, source: str, columns: Sequence[int], text: str) -> None:

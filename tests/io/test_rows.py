@@ -1,4 +1,4 @@
-"""Which rows are read, by `--where COLUMN=VALUE`, that their lines keep their numbers, and columns that never change."""
+"""Which rows are read, by `--where COLUMN=VALUE`; that lines keep their numbers; columns that never change."""
 
 import io
 
