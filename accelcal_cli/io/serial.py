@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -29,7 +29,10 @@ PATIENCE = 100
 SHOWN = 60
 """Characters of a line that a message shows."""
 
-FIRST = 12
+FEWEST, EVEN = 6, 4.0
+"""Readings that show whether the first number is time, and the ratio of its steps at most."""
+
+FIRST = 24
 """Lines that show whether they are of several kinds."""
 
 _CLOCK = re.compile(r"(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?:\s*->)?(?![\w:])")
@@ -116,6 +119,9 @@ def readings(
     if kinds is None and columns is None:
         kinds = _named(first, source)
     named = _axes(kinds) if columns is None else None
+    if columns is None and _are_timed(first, kinds):
+        columns = range(1, 4)
+        tell(f"{source}: the first number of each line taken as time: it increases")
     columns = columns or range(3)
     if kinds is not None and (note := kinds.note()):
         tell(f"{source}: {note}")
@@ -154,6 +160,16 @@ def _named(lines: Sequence[str], source: str) -> LineFilter | None:
         kinds = find_filter(lines, source)
         return kinds if _axes(kinds) else None
     return None
+
+
+def _are_timed(lines: Sequence[str], kinds: LineFilter | None) -> bool:
+    """Return whether the first of four or seven numbers is time: it increases, in steps of about one size."""
+    if kinds is not None:
+        lines = [" ".join(kinds.values(line) or ()) for line in lines]
+    rows = [row for line in lines if (row := numbers(_CLOCK.sub("", line)))]
+    steps = [other[0] - one[0] for one, other in pairwise(rows)]
+    even = len(rows) >= FEWEST and 0 < max(steps) <= EVEN * min(steps)
+    return even and all(len(row) in (4, 7) for row in rows)
 
 
 def _axes(kinds: LineFilter | None) -> Sequence[int] | None:

@@ -104,3 +104,14 @@ def test_several_kinds_are_said():
         open_raw_log("-", stdin=io.BytesIO(b"\n".join(alone)))
     stamped = [b"12:30:01.250 -> a 1 2 3", b"12:30:01.260 -> b 4 5 6"] * 9
     assert next(readings(stamped, None, "port", "b")).tolist() == [4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    "form", ["{} {} {} {}", "$ACC,{},{},{},{}*5A\n$GYR,1,0.1,0.2,0.3*58", "{},{},{},{},7,8,9"]
+)
+def test_a_first_number_that_increases_is_time(form):
+    said: list[str] = []
+    text = "".join(form.format(20 * k, *row) + "\n" for k, row in enumerate(AXES))
+    found = list(readings(file_lines(io.BytesIO(text.encode())), None, "port", tell=said.append))
+    np.testing.assert_array_equal(found, AXES)
+    assert "port: the first number of each line taken as time: it increases" in said
