@@ -57,6 +57,9 @@ MOST = 0.6
 EPOCH = 1e8
 """A first row of one number, at least this large, is the start of a recording in seconds since 1970."""
 
+REMARKS = ("comment", "comments", "remark", "remarks", "bemerkung", "commentaire")
+"""Names of a last column that rows may lack."""
+
 FAR = 50.0
 """A row of running numbers is a header where the rows below it are so many times larger."""
 
@@ -215,8 +218,8 @@ def _of_messages(head: bytes, source: str, wanted: str | None) -> tuple[MessageF
 def _is_worded(dialect: Dialect) -> bool:
     """Return whether words stand between the numbers of a line rather than above them."""
     numbers = sum(looks_numeric(cell) for cell in dialect.first)
-    cells = dialect.first if dialect.header_line == 0 else dialect.names or ()
-    marked = any(_MARKED.fullmatch(cell) for cell in cells)
+    lines = [dialect.first] if dialect.header_line == 0 else [dialect.names or (), dialect.first]
+    marked = all(any(_MARKED.fullmatch(cell) for cell in cells) for cells in lines)
     return marked or (dialect.header_line == 0 and numbers < 3)
 
 
@@ -434,7 +437,7 @@ def find_layout(texts: Sequence[str], rows: Sequence[Sequence[str]], separator: 
         bare = bool(rows) and not any(looks_numeric(cell) for cell in rows[0])
         return Layout(1, tuple(rows[0]), 0) if bare else Layout(0)
     alike = [_is_row(cells, width, numeric) for cells in rows]
-    first = _first_row(rows, alike)
+    first = _below_title(rows, alike, _first_row(rows, alike), width)
     start = _stated_start(rows[first : first + 2])
     if start is not None:
         return Layout(first + start[0], rate=start[1])
@@ -485,6 +488,20 @@ def _first_row(rows: Sequence[Sequence[str]], alike: Sequence[bool]) -> int:
     return first
 
 
+def _below_title(rows: Sequence[Sequence[str]], alike: Sequence[bool], first: int, width: int) -> int:
+    """Return the first row, below a header among lines of which only some look like rows: these describe columns."""
+    for k in range(first, min(first + AHEAD, len(rows) - 1)):
+        odd = alike[first:k].count(False) > 1 and not alike[k]
+        if (
+            odd
+            and all(alike[k + 1 : k + AHEAD])
+            and _is_title(rows[k], rows[k + 1], width)
+            and is_known(rows[k])
+        ):
+            return k + 1
+    return first
+
+
 def _stated_start(rows: Sequence[Sequence[str]]) -> tuple[int, float | None] | None:
     """Return how many rows state start and rate, the same number in every column, and the rate; None for none."""
     equal = [len(cells) > 2 and len(set(cells)) == 1 and looks_numeric(cells[0]) for cells in rows]
@@ -521,6 +538,12 @@ def _with_header(
         if whole is None:
             break
         block[k] = whole
+    if not block:  # headers and units may stand further up, each below a line that says so
+        block = {
+            k: list(cells)
+            for k, cells in enumerate(rows[:first])
+            if _is_title(cells, rows[first], width) and (is_known(cells) or is_unit_row(cells))
+        }
     if not block:
         wrong = (
             first and is_known(rows[first - 1]) and not any(looks_numeric(cell) for cell in rows[first - 1])
@@ -533,16 +556,21 @@ def _with_header(
     header = max(titles, key=lambda k: (_score(block[k]), k))
     below = next((tuple(block[k]) for k in units if k > header and any(map(_says, block[k]))), None)
     names = _grouped(block.get(header - 1) if header - 1 in titles else None, block[header])
-    return Layout(first, tuple(names), header, below)
+    return Layout(first, tuple(names[:-1] if _ends_in_remark(names, width) else names), header, below)
 
 
 def _is_title(cells: Sequence[str], row: Sequence[str], width: int) -> bool:
     """Return whether a line can be a header of rows: as many cells, few of them numbers."""
     ended = len(cells) == width - 1 and not row[-1]  # rows with a separator at their end
-    if not (fits(cells, width) or ended) or not any(cells):
+    if not (fits(cells, width) or ended or _ends_in_remark(cells, width)) or not any(cells):
         return False
     numbers = sum(looks_numeric(cell) for cell in cells)
     return not numbers or (is_known(cells) and 2 * numbers < sum(bool(cell) for cell in cells))
+
+
+def _ends_in_remark(names: Sequence[str], width: int) -> bool:
+    """Return whether a header has one more column, for remarks, which rows may lack."""
+    return len(names) == width + 1 and names[-1].lower() in REMARKS
 
 
 def _says(unit: str) -> bool:
@@ -551,7 +579,7 @@ def _says(unit: str) -> bool:
 
 def _score(names: Sequence[str]) -> int:
     """Return how many cells of a line are names that are known."""
-    return sum(bool(name) and (is_time(name) or describe(name).axis is not None) for name in names)
+    return sum(bool(name) and (is_time(name) or describe(name).is_axis) for name in names)
 
 
 def is_known(names: Sequence[str]) -> bool:

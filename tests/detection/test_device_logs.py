@@ -163,6 +163,7 @@ STAMPS = {
     "Excel days": lambda t: f"{45637.5 + t / 86400000:.9f}",
     "MATLAB days": lambda t: f"{739597.5 + t / 86400000:.9f}",
     "millis": lambda t: str(5000 + t),
+    "durations": lambda t: f"{t / 1000:.2f} sec",
 }
 
 
