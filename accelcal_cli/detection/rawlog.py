@@ -20,7 +20,7 @@ from accelcal_cli.io.clock import UNITS, Clock, SoundTimes, seconds_of_dates, un
 from accelcal_cli.io.columns import RawColumns, choose_raw, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, Selection, open_table
 from accelcal_cli.io.readings import InputForm
-from accelcal_cli.io.rows import MOST_SENSORS, SKIPPABLE, OneSensor, RowBlock, ZeroRows
+from accelcal_cli.io.rows import MOST_SENSORS, SKIPPABLE, DeadColumns, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.vocabulary import parse_unit
 from accelcal_cli.notices import Notice
 
@@ -199,13 +199,16 @@ class RawLog:
             (6 if self.columns.gyro else 3) + (self.columns.temperature is not None) + timed,
             -np.inf,
         )
+        dead = DeadColumns(self.name, self.columns.names)
         for rows in chain(self._head, self._rows):
             numbers = rows.numbers[:, :width]
-            self.zeros.keep(numbers[:, :3], rows.start)
+            kept = self.zeros.keep(numbers[:, :3], rows.start)
+            dead.add(numbers[:, :3] if kept is None else numbers[kept, :3])
             if timed and len(numbers):
                 self._check_time(numbers[:, -1], last, rows.start)
                 last = float(numbers[-1, -1])
             yield numbers
+        dead.check()
 
     def gyro_names(self) -> tuple[str, ...]:
         """Return the names of the gyroscope columns, or their numbers from 1; none without a gyroscope."""

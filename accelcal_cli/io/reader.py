@@ -29,6 +29,7 @@ from accelcal_cli.io.dialect import (
     is_comment,
     looks_numeric,
     split_cells,
+    to_number,
     understand,
 )
 from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
@@ -194,6 +195,11 @@ class TextTable:
         self._lines = LineMap()
 
     @property
+    def translated(self) -> bool:
+        """Whether the rows are not the lines of the input but what was found in them."""
+        return self._words is not None
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the bytes read so far."""
         return self._source.sha256
@@ -201,7 +207,7 @@ class TextTable:
     @property
     def source_format(self) -> str:
         """How the text is written."""
-        form = "words" if self._words else SEPARATORS[self.dialect.separator]
+        form = SEPARATORS[self.dialect.separator] if self._words is None else self._words.form
         return ", ".join(
             ["text", form, *(["decimal comma"] * self.dialect.decimal_comma), *self._source.forms]
         )
@@ -230,6 +236,8 @@ class TextTable:
         """Return the cells of some rows of the head that are read, spread over it."""
         head = self._source.head if self._words is None else self._words.translate(self._source.head)
         lines = head.splitlines()[self.dialect.top :]
+        if self._words is not None:
+            lines = [line for line in lines if line]
         step = max(1, len(lines) // (2 * SAMPLE)) if len(lines) > 2 * SAMPLE else 1
         texts = [line.decode(errors="replace") for line in lines[::step]]
         rows = (
@@ -516,17 +524,6 @@ class FastParser:
             quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
         )
         return None if broken or short else frame
-
-
-def to_number(cell: str, decimal_comma: bool) -> float | None:
-    """Return the value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
-    thousands = decimal_comma and "." in cell  # 1.234,5 and 1.234
-    if thousands or "_" in cell or not cell.isascii():
-        return None
-    try:
-        return float(cell.replace(",", ".", 1) if decimal_comma else cell)
-    except ValueError:
-        return None
 
 
 def shorten(text: str) -> str:
