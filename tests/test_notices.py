@@ -100,6 +100,7 @@ def _screened():
         *of(np.clip(DPSO.output(G * TURNS), -5.4e6, 5.4e6)),
         *of(fine, scatter=scatter, count=count),
         *of(fine, scatter=alone, count=count),
+        *of(fine, scatter=np.full((24, 3), 5e3) * [1, 1, 4], count=np.geomspace(10, 1000, 24)),
         *of(coarse, scatter=np.zeros((96, 3)), count=np.full(96, 9.0), behind=NOTHING.and_also(coarse, 96)),
         *of(other),
         *zero_rows(2, "line 3", 20),
@@ -214,3 +215,9 @@ def test_every_remedy_is_an_action_or_a_command_that_runs():
             command.make_context(name, words)
         elif notice.remedy:
             assert notice.remedy.endswith("."), notice
+
+
+def test_every_key_is_documented():
+    page = (Path(__file__).parent.parent / "docs/reference/result-file.md").read_text(encoding="utf-8")
+    table = page.split("Keys of warnings")[1].split("\n\n")[1]
+    assert set(re.findall(r"^\| `([a-z-]+)`", table, re.M)) == KEYS

@@ -21,7 +21,7 @@ from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
 from accelcal_cli.io.rows import RowBlock, ZeroRows, add_stretches, places, zero_rows
-from accelcal_cli.io.screening import LOOKED_AT, Screened, needs_look
+from accelcal_cli.io.screening import LOOKED_AT, UNEQUAL, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
 from accelcal_cli.notices import Notice
 
@@ -164,6 +164,8 @@ class FleetReadings:
         doubtful = needs_look(batch.output[:, :LOOKED_AT], batch.count)
         if batch.scatter is not None:
             doubtful |= (batch.scatter == 0).any(axis=(1, 2))
+            noise = np.sqrt((batch.scatter**2).sum(axis=2) / (1.0 if batch.behind is None else batch.behind))
+            doubtful |= noise.max(axis=1) > UNEQUAL * noise.min(axis=1)
         return np.asarray(doubtful | np.isin(batch.sensors, list(self.zeros)))
 
     def labelled(self, batch: Batch) -> Bool:

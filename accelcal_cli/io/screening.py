@@ -75,6 +75,9 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 LIVELY = 10.0
 """A scatter that is stated tells readings without any where the others are so many of its own last digits."""
 
+UNEQUAL, TELLING = 3.0, 10
+"""Factor between the noise of poses, or of axes, that is told of, and readings of each pose that tell it."""
+
 COARSE = 2.0
 """Steps over the scatter of the readings from which on an average of many is no finer than one: the noise is below
 0.4 of a step."""
@@ -152,7 +155,12 @@ class Screened:
             return tuple(self._one_point())
         found = [*self._log(), *dead, *self._copies(), *frozen]
         if not dead:
-            found += [*self._clipped(), *self._quantised(), *(() if frozen else self._several())]
+            found += [
+                *self._clipped(),
+                *self._quantised(),
+                *self._unequal(),
+                *(() if frozen else self._several()),
+            ]
         return tuple(sorted(found, key=lambda notice: notice.severity != "warning"))
 
     @cached_property
@@ -359,6 +367,21 @@ class Screened:
             yield Notice(
                 "quantised", "note", text, "Choose a finer resolution or a narrower range of the sensor."
             )
+
+    def _unequal(self) -> Iterator[Notice]:
+        """Poses or axes whose noise differs by a factor: sigma knows, an unweighted fit makes no use of it."""
+        if self.scatter is None or self.count is None or len(self.output) < FEWEST:
+            return
+        if not (self.count >= TELLING).all() or not np.isfinite(self.scatter).all():
+            return
+        poses = np.sqrt((self.scatter**2).mean(axis=1) / self.count)
+        for what, noise in (("poses", poses), ("axes", self._usual_scatter)):
+            low, high = np.quantile(noise, [0.1, 0.9]) if len(noise) > 3 else (noise.min(), noise.max())
+            if high > UNEQUAL * low > 0:
+                text = f"The noise of the {what} differs by a factor of {high / low:.2g}; sigma counts that."
+                yield Notice(
+                    "unequal-noise", "note", text, "Add --weights auto, which counts poses by their noise."
+                )
 
     def _several(self) -> Iterator[Notice]:
         poses = len(self.output)

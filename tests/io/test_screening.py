@@ -255,6 +255,23 @@ def test_coarse_rows_of_labelled_poses_are_neither_frozen_nor_copies(step):
             assert ("quantised" in found) == (part < 0.4)
 
 
+def test_noise_that_differs_between_poses_or_axes_is_noted():
+    rng = np.random.default_rng(25)
+    rows = output(rng, attitudes("turns", rng), mg=0.1)
+    scatter = 0.02 * np.sqrt(rng.chisquare(19, (24, 3)) / 19)
+    for size, count, words in (
+        ([1, 1, 1], np.full(24, 20.0), ()),
+        ([1, 1, 4], np.full(24, 20.0), ("the axes differs by a factor of",)),
+        ([1, 1, 1], np.geomspace(10, 1000, 24), ("the poses differs by a factor of",)),
+    ):
+        found = Screened(
+            rows, ("ax", "ay", "az"), 24, str, single=False, count=count, scatter=scatter * size
+        ).notices()
+        assert [notice.key for notice in found] == ["unequal-noise"] * len(words)
+        assert all(word in notice.text for word, notice in zip(words, found, strict=True))
+        assert {notice.severity for notice in found} <= {"note"}
+
+
 def test_a_log_is_told_from_poses_with_many_rows():
     rng = np.random.default_rng(5)
     still = np.repeat(output(rng, attitudes("turns", rng)), 60, axis=0)
