@@ -45,6 +45,9 @@ MOST_PRIOR = 1e6
 MOST_TREMOR = 0.3
 """Tremor, rad rms, beyond which a sensor is turned rather than held."""
 
+LEAST_SHORTENING = 0.05
+"""Shortening of the mean of a pose, in parts of its noise, that matters among nine poses; among more, less does."""
+
 SURELY_TREMBLES = 4.0
 """Standard deviations of the tangential excess beyond which a hand trembles: by chance 1 in 30 000."""
 
@@ -258,6 +261,10 @@ def tremor(sample: Sample, K: Float, D: Float, g: float) -> Tremor | None:
     # Of these readings, not of all that might have been.
     excess = np.where(own > 0, excess * own / (own + 1.0), 0.0)
     angle = np.sqrt(np.maximum(tau, 0.0)) / g
+    # Where it shortens no pose by more than a small part of what noise does, there is nothing to give back.
+    count = np.maximum(np.nan_to_num(sample.count), 1.0)
+    least = LEAST_SHORTENING * np.sqrt(9.0 / sample.poses)[:, None] * np.sqrt(along / count)
+    certainty = np.where((excess / g > least).any(axis=1), certainty, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         doubt = np.where(whole | (square <= 0), 0.0, np.sqrt(2.0) * size / np.sqrt(square) / g)
         doubt = doubt + np.einsum("rj,rj->r", own, second) / total / g
