@@ -25,11 +25,11 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
-from accelcal_cli.calibration.sample import NO_NOISE
+from accelcal_cli.calibration.sample import NO_NOISE, axis_up
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.notices import Notice, Severity, are_serious
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
-from accelcal_cli.sensor.poses import AXES, axis_up
+from accelcal_cli.sensor.poses import AXES
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""

@@ -25,6 +25,7 @@ from accelcal_cli.calibration.noise import (
 )
 from accelcal_cli.calibration.observability import (
     ALIGNED,
+    STANDARD,
     CellCount,
     Geometry,
     Observability,
@@ -209,7 +210,7 @@ def fit(solution: Solution) -> Fit:
     spread, clusters = _spread(solution, point, sums)
     at_wall, shown = _at_wall(solution.x), to_gauge(point.K, settings.gauge)
     view, information, sight = _first_sight(solution, point)
-    geometry = _geometry(solution, information, sight, held)
+    geometry = _geometry(solution, view, information, sight, held)
     verdicts, walled = geometry.observability.verdicts, np.asarray(at_wall.any(axis=1))
     covariance = _covariance(observability, verdicts, spread, walled, g)
     sigma_K, sigma_D = propagate(shown, point.lower, covariance, settings.gauge, g)
@@ -273,7 +274,7 @@ def quick_fit(readings: Readings, settings: Settings) -> QuickFit:
             return QuickFit(ErrorModel(K[0], D[0]), np.nan, np.nan, "undetermined")
     solution = unsearched(plain if settings.weights == "none" else state(sample, settings))
     point = _point(solution, None)
-    geometry = _geometry(solution, *_first_sight(solution, point)[1:], None).observability[0]
+    geometry = _geometry(solution, *_first_sight(solution, point), None).observability[0]
     s = np.sqrt(_variance(solution, np.zeros((7, 1)), point.freedom)[0])
     parts = [length_error(e[0], settings.g) for _, e, _ in sample.errors(point.lower, point.D, settings.g)]
     rms = np.sqrt(np.mean(np.concatenate(parts) ** 2))
@@ -381,7 +382,11 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
 
 
 def _geometry(
-    solution: Solution, information: Float, sight: tuple[Float, Float], held: Bool | None
+    solution: Solution,
+    view: Observability,
+    information: Float,
+    sight: tuple[Float, Float],
+    held: Bool | None,
 ) -> Geometry:
     """Return what the distinct attitudes of the poses determine, seen with the sensors `sight`.
 
@@ -409,6 +414,8 @@ def _geometry(
     alike = attitudes == sample.poses
     if solution.stated.settings.weights != "none" or solution.stated.rejected is not None:
         alike = np.zeros_like(alike)
+    if alike.all() and int(attitudes.max()) <= STANDARD:
+        return Geometry(attitudes, view, information)
     return Geometry.of(np.where(alike[:, None, None], information, once), attitudes, held)
 
 

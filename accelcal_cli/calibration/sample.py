@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.io.screening import LOOKED_AT
-from accelcal_cli.sensor.poses import axis_up
+from accelcal_cli.sensor.poses import AXES
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -41,6 +42,22 @@ NORMAL_MAD = 1.4826
 
 SCALE_SAMPLE = 100_000
 """At most about this many residuals decide the scale of a robust loss."""
+
+
+UP_OR_DOWN = re.compile(
+    r"(?<![a-z0-9])(?P<sign>[+-]?)(?P<axis>[xyz])[\s_-]*(?:axis[\s_-]*)?(?P<way>up|down)(?![a-z])",
+    re.IGNORECASE,
+)
+"""What in a label says which way a sensor axis points: "+x up", "-z up", "x_down", "Y axis up"."""
+
+
+def axis_up(label: str) -> tuple[int, int] | None:
+    """Return the axis, 0 to 2, that a label says something of, and 1 if its positive end is up, else -1; or None."""
+    found = UP_OR_DOWN.search(label)
+    if found is None:
+        return None
+    up = 1 if found["way"].lower() == "up" else -1
+    return AXES.index(found["axis"].lower()), -up if found["sign"] == "-" else up
 
 
 def _name_up(where: Callable[[int], str], poses: Iterable[int]) -> bool:

@@ -32,9 +32,12 @@ def command(
     ] = 115200,
     timeout: Annotated[float, options.in_input(help="Longest silence of the port, seconds.")] = 10.0,
     columns: Annotated[
-        str,
-        options.in_input(help="Which numbers of a line are x, y and z, counted from 1, separated by commas."),
-    ] = "1,2,3",
+        str | None,
+        options.in_input(
+            help="Which numbers of a line are x, y and z, counted from 1, separated by commas.",
+            show_default="found by their words, else 1,2,3",
+        ),
+    ] = None,
     line: Annotated[
         str | None,
         options.in_input(
@@ -91,7 +94,7 @@ def command(
     from accelcal_cli.sensor.model import OUTPUT_OF_1_G
 
     options.check_choice("--fixture", fixture, options.FIXTURES[:-1])
-    chosen = _columns(columns)
+    chosen = None if columns is None else _columns(columns)
     for name, seconds in (("window", window), ("hold", hold), ("timeout", timeout), ("rate", rate)):
         options.check_positive(f"--{name}", seconds)
     options.check_positive("--still", still)

@@ -188,12 +188,12 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     kept = best(enough, candidates) if enough else nearest(segmentations, candidates)
     intervals = segmentations[kept].intervals
     gaps = tiles.gaps.notes(log.clock.unit)
-    zeros, shown = log.zeros, intervals if not enough else _combine(intervals, settings)
+    shown = intervals if not enough else _combine(intervals, settings)
     warnings = (
         *in_turn,
         *lively.clipped(shown, log.columns.names),
         *lively.notices(tiles.size),
-        *zeros.notices(log.where, tiles.rows - zeros.count),
+        *log.zero_rows(tiles.rows),
     )
     detection = Detection(
         source=log.name,

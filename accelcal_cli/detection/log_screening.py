@@ -128,7 +128,8 @@ class Liveliness:
 
         In an honest hold some readings are far above the mean, so that the extreme of the log is, too.
         """
-        marks = np.zeros((len(intervals), 3, 2), dtype=bool)
+        poses = len(intervals.n)
+        marks = np.zeros((poses, 3, 2), dtype=bool)
         reach = np.array([_reach(n) for n in intervals.n.tolist()])[:, None]
         rails = [bits_of_rail(float(v)) for v in (*self.low, *self.high)]
         ends = max(np.count_nonzero([bits == n for bits in rails]) for n in rails if n) if any(rails) else 0
@@ -149,7 +150,7 @@ class Liveliness:
         shown = named([intervals.where(k) for k in holds[:SHOWN].tolist()], len(holds))
         text = (
             f"Clipped readings: column {', '.join(columns)}, an end of the range, in {len(holds)} of "
-            f"{len(intervals)} poses ({shown})."
+            f"{poses} poses ({shown})."
         )
         return (
             Notice(

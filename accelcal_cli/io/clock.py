@@ -84,6 +84,7 @@ _STAMP = re.compile(
     r"(?P<clock>(?:(?:(?P<h>\d{1,3}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2})|(?P<compact>\d{6}))(?:[.,:](?P<f>\d{1,9}))?)?"
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>[zZ]|UTC|GMT|(?:UTC|GMT)?[+-]\d\d?(?::?\d\d)?)?"
 )
+_DURATION = re.compile(r"([-+]?\d+(?:\.\d+)?) ?(s|sec|ms|us|min|hr|h)")
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:[zZ]|[+-]\d\d(?::?\d\d)?)?")
 _ZONE = re.compile(r"(?:[zZ]|[+-]\d\d(?::?\d\d)?)$")
 
@@ -418,6 +419,8 @@ def _is_iso(cell: str) -> bool:
 
 def _parse(cell: str) -> _Stamp | None:
     """Return the parts of a cell, None where it is no time."""
+    if duration := _DURATION.fullmatch(cell.strip()):
+        return _Stamp("", float(duration[1]) * UNITS[parse_unit(duration[2]) or "s"], math.inf, None)
     match = _STAMP.fullmatch(cell.strip())
     if match is None or not (match["clock"] or match["date"]) or (match["compact"] and not match["date"]):
         return None

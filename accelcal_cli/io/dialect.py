@@ -29,7 +29,7 @@ from accelcal_cli.io.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from accelcal_cli.io.lines import LineFilter
+    from accelcal_cli.io.lines import LineFilter, MessageFilter
 
 SAMPLE = 1000
 """Content lines that the dialect is found from."""
@@ -41,6 +41,9 @@ MARKS = ("#", "//", "%")
 """What a line of comment begins with."""
 
 BOM = b"\xef\xbb\xbf"
+
+OPENING = 1 << 16
+"""Bytes in which an ArduPilot log says what its messages are."""
 
 TAIL = 64
 """Last lines of a sample by which rows are known: what stands above a table is no longer among them."""
@@ -54,6 +57,9 @@ MOST = 0.6
 EPOCH = 1e8
 """A first row of one number, at least this large, is the start of a recording in seconds since 1970."""
 
+REMARKS = ("comment", "comments", "remark", "remarks", "bemerkung", "commentaire")
+"""Names of a last column that rows may lack."""
+
 FAR = 50.0
 """A row of running numbers is a header where the rows below it are so many times larger."""
 
@@ -65,8 +71,8 @@ FEWEST_THOUSANDS = 6
 """Cells such as 33,368 from which on they are thousands, where none says that the comma is a decimal mark."""
 
 
-_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->")
-"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``."""
+_MARKED = re.compile(r"(?:[^\W\d]|#).*[:=]\s*[-+]?(?:\d+\.?\d*|\.\d+)?|[:=|>]|->|\$[A-Z]+")
+"""A cell that is a word with its number, or the mark between them: ``Raw:``, ``aX:3.66``, ``=``, ``$ACC``."""
 
 
 class ThousandsError(DataError):
@@ -104,6 +110,12 @@ class Dialect:
     def marks(self) -> tuple[str, ...]:
         """What a line of comment begins with."""
         return MARKS if self.separator == ";" else (*MARKS, ";")
+
+    def notes(self) -> list[str]:
+        """Say what stands above the table and was understood of it, if anything does."""
+        above, facts = self.above, str(self.facts)
+        skipped = f"{above:,} line{'s' * (above != 1)} above the table skipped" if above else "comments"
+        return [skipped + f": {facts}" * bool(facts)] if above or facts else []
 
 
 @dataclass(frozen=True)
@@ -146,9 +158,20 @@ def looks_numeric(cell: str, decimal_comma: bool = True) -> bool:
     return True
 
 
+def to_number(cell: str, decimal_comma: bool) -> float | None:
+    """Return the value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
+    thousands = decimal_comma and "." in cell  # 1.234,5 and 1.234
+    if thousands or "_" in cell or not cell.isascii():
+        return None
+    try:
+        return float(cell.replace(",", ".", 1) if decimal_comma else cell)
+    except ValueError:
+        return None
+
+
 def understand(
     head: bytes, source: str, skip: int = 0, prefix: str | None = None
-) -> tuple[LineFilter | None, Dialect]:
+) -> tuple[LineFilter | MessageFilter | None, Dialect]:
     """Return the dialect of a text, and the filter of its lines where its numbers stand among words.
 
     Args:
@@ -158,6 +181,8 @@ def understand(
     Raises:
         DataError: neither a table nor lines of readings.
     """
+    if b"FMT," in head[:OPENING] and (found := _of_messages(head, source, prefix)):
+        return found
     dialect: Dialect | None = None
     fault: DataError | None = None
     if prefix is None:
@@ -172,23 +197,35 @@ def understand(
     from accelcal_cli.io.lines import find_filter  # most texts have no words between their numbers
 
     lines = head[: 1 << 18].decode(errors="replace").splitlines()[skip:]
-    found = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
-    if found is None:
+    words = find_filter([line for line in lines if line.strip()][: 2 * SAMPLE], source, prefix)
+    if words is None:
         if dialect is None:
             raise fault or DataError(f"{source}: no line has three numbers; readings were expected")
         return None, dialect
-    dialect = sniff(found.translate(head), source, skip)
-    units = found.kind.units if any(found.kind.units) else None
-    if found.kind.names is not None:
-        dialect = replace(dialect, names=found.kind.names, header_line=0)
-    return found, replace(dialect, units=units, above=0)
+    dialect = sniff(words.translate(head), source, skip)
+    units = words.kind.units if any(words.kind.units) else None
+    if words.kind.names is not None:
+        dialect = replace(dialect, names=words.kind.names, header_line=0)
+    return words, replace(dialect, units=units, above=0)
+
+
+def _of_messages(head: bytes, source: str, wanted: str | None) -> tuple[MessageFilter, Dialect] | None:
+    """Return filter and dialect of an ArduPilot log, None for any other text."""
+    from accelcal_cli.io.lines import find_messages
+
+    messages = find_messages(head, source, wanted)
+    if messages is None:
+        return None
+    rows = (line for line in messages.translate(head).splitlines() if line.strip())
+    first = split_cells(next(rows, b"").decode(errors="replace"), ",")
+    return messages, Dialect(",", False, messages.columns, 0, tuple(first), units=messages.units)
 
 
 def _is_worded(dialect: Dialect) -> bool:
     """Return whether words stand between the numbers of a line rather than above them."""
     numbers = sum(looks_numeric(cell) for cell in dialect.first)
-    cells = dialect.first if dialect.header_line == 0 else dialect.names or ()
-    marked = any(_MARKED.fullmatch(cell) for cell in cells)
+    lines = [dialect.first] if dialect.header_line == 0 else [dialect.names or (), dialect.first]
+    marked = all(any(_MARKED.fullmatch(cell) for cell in cells) for cells in lines)
     return marked or (dialect.header_line == 0 and numbers < 3)
 
 
@@ -406,7 +443,7 @@ def find_layout(texts: Sequence[str], rows: Sequence[Sequence[str]], separator: 
         bare = bool(rows) and not any(looks_numeric(cell) for cell in rows[0])
         return Layout(1, tuple(rows[0]), 0) if bare else Layout(0)
     alike = [_is_row(cells, width, numeric) for cells in rows]
-    first = _first_row(rows, alike)
+    first = _below_title(rows, alike, _first_row(rows, alike), width)
     start = _stated_start(rows[first : first + 2])
     if start is not None:
         return Layout(first + start[0], rate=start[1])
@@ -457,6 +494,20 @@ def _first_row(rows: Sequence[Sequence[str]], alike: Sequence[bool]) -> int:
     return first
 
 
+def _below_title(rows: Sequence[Sequence[str]], alike: Sequence[bool], first: int, width: int) -> int:
+    """Return the first row, below a header among lines of which only some look like rows: these describe columns."""
+    for k in range(first, min(first + AHEAD, len(rows) - 1)):
+        odd = alike[first:k].count(False) > 1 and not alike[k]
+        if (
+            odd
+            and all(alike[k + 1 : k + AHEAD])
+            and _is_title(rows[k], rows[k + 1], width)
+            and is_known(rows[k])
+        ):
+            return k + 1
+    return first
+
+
 def _stated_start(rows: Sequence[Sequence[str]]) -> tuple[int, float | None] | None:
     """Return how many rows state start and rate, the same number in every column, and the rate; None for none."""
     equal = [len(cells) > 2 and len(set(cells)) == 1 and looks_numeric(cells[0]) for cells in rows]
@@ -493,6 +544,12 @@ def _with_header(
         if whole is None:
             break
         block[k] = whole
+    if not block:  # headers and units may stand further up, each below a line that says so
+        block = {
+            k: list(cells)
+            for k, cells in enumerate(rows[:first])
+            if _is_title(cells, rows[first], width) and (is_known(cells) or is_unit_row(cells))
+        }
     if not block:
         wrong = (
             first and is_known(rows[first - 1]) and not any(looks_numeric(cell) for cell in rows[first - 1])
@@ -505,16 +562,21 @@ def _with_header(
     header = max(titles, key=lambda k: (_score(block[k]), k))
     below = next((tuple(block[k]) for k in units if k > header and any(map(_says, block[k]))), None)
     names = _grouped(block.get(header - 1) if header - 1 in titles else None, block[header])
-    return Layout(first, tuple(names), header, below)
+    return Layout(first, tuple(names[:-1] if _ends_in_remark(names, width) else names), header, below)
 
 
 def _is_title(cells: Sequence[str], row: Sequence[str], width: int) -> bool:
     """Return whether a line can be a header of rows: as many cells, few of them numbers."""
     ended = len(cells) == width - 1 and not row[-1]  # rows with a separator at their end
-    if not (fits(cells, width) or ended) or not any(cells):
+    if not (fits(cells, width) or ended or _ends_in_remark(cells, width)) or not any(cells):
         return False
     numbers = sum(looks_numeric(cell) for cell in cells)
     return not numbers or (is_known(cells) and 2 * numbers < sum(bool(cell) for cell in cells))
+
+
+def _ends_in_remark(names: Sequence[str], width: int) -> bool:
+    """Return whether a header has one more column, for remarks, which rows may lack."""
+    return len(names) == width + 1 and names[-1].lower() in REMARKS
 
 
 def _says(unit: str) -> bool:
@@ -523,7 +585,7 @@ def _says(unit: str) -> bool:
 
 def _score(names: Sequence[str]) -> int:
     """Return how many cells of a line are names that are known."""
-    return sum(bool(name) and (is_time(name) or describe(name).axis is not None) for name in names)
+    return sum(bool(name) and (is_time(name) or describe(name).is_axis) for name in names)
 
 
 def is_known(names: Sequence[str]) -> bool:

@@ -1,7 +1,8 @@
 """Lines of words and numbers, as sketches print them: ``AcX = 12 | AcY = -5``, ``Raw: 1, 2, 3``, ``#A-R=1,2,3``.
 
-Lines are of one kind when nothing but their numbers differs. `choose_kind` finds the kind that holds acceleration among
-those of a sample, and `LineKind.row` its numbers in a line; files and live streams use the same.
+Lines are of one kind when nothing but their numbers differs. `find_filter` finds the kind that holds acceleration among
+those of a sample, and `LineKind.row` its numbers in a line; files and live streams use the same. The text logs of
+ArduPilot say themselves, in their FMT lines, what the numbers of each kind are (`find_messages`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
@@ -16,16 +18,40 @@ from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
 RARE = 0.02
 """Part of the lines of a sample below which a kind is an accident."""
 
+MOST_WORDED = 0.9
+"""Part of the lines with words and too few numbers from which on they are no table either."""
+
 SHOWN = 5
 """Kinds that a message names at most."""
 
 COLUMNS_OF_NINE = ("ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz")
 """What nine numbers behind one word are, as in the ``Raw:`` lines that MotionCal reads."""
 
+MESSAGES = ("IMU", "ACC")
+"""Messages of ArduPilot that are taken first, in this order."""
+
+FORCE_COLUMNS = ("AccX", "AccY", "AccZ")
+
+MESSAGE_UNITS = {
+    "TimeUS": "us",
+    "SampleUS": "us",
+    "TimeMS": "ms",
+    "T": "degC",
+    "Temp": "degC",
+    **dict.fromkeys(FORCE_COLUMNS, "m/s^2"),
+    **dict.fromkeys(("GyrX", "GyrY", "GyrZ"), "rad/s"),
+}
+"""Units of the columns of ArduPilot's messages of inertial sensors."""
+
+_FORMAT = re.compile(rb"^FMT,\s*\d+,\s*\d+,\s*(\w+),\s*\w*,(.*)$", re.MULTILINE)
 _VALUE = re.compile(
-    r"(?P<clock>(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?![\w:]))"
+    r"(?P<clock>(?<![\w.:])(?:\d{4}[-/]\d\d[-/]\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?!\w|[.:]\d))"
     r"|(?P<number>(?<![\w.^/])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"
 )
+_CLOCK = re.compile(r"\s*((?:\d{4}[-/]\d\d[-/]\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?)(?!\w|[.:]\d)[\s:>-]*")
+"""The time that terminal programs write before each line."""
+
+_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"'>-]+")
 
 
@@ -34,12 +60,14 @@ class LineKind:
     """A kind of line.
 
     Attributes:
-        lead: the words before its first number, by which it is called; words: lower case, between the numbers.
+        lead: the words before its first number; name: these, or those behind a time, by which it is called.
+        words: lower case, between the numbers.
         labels: a name for each number, "" where it has none; units: the unit behind it, "" where there is none.
         share: its part of the sample.
     """
 
     lead: str
+    name: str
     words: tuple[str, ...]
     labels: tuple[str, ...]
     units: tuple[str, ...]
@@ -84,6 +112,7 @@ class LineFilter:
     kind: LineKind
     kinds: tuple[LineKind, ...]
     prefix: str = ""
+    form: ClassVar[str] = "words"
 
     def translate(self, block: bytes) -> bytes:
         """Return a block of lines as rows: one line each, empty where it is of another kind."""
@@ -115,16 +144,79 @@ class LineFilter:
         return rest if self.kind.begins(rest) else ""
 
 
+@dataclass(frozen=True)
+class MessageFilter:
+    """The lines of one message of an ArduPilot log, without its name, as comma-separated rows.
+
+    Attributes:
+        message: its name; columns: as its FMT line names them; others: messages with acceleration that are left out.
+    """
+
+    message: str
+    columns: tuple[str, ...]
+    others: tuple[str, ...] = ()
+    form: ClassVar[str] = "comma"
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the columns, "" where they are unknown."""
+        return tuple(MESSAGE_UNITS.get(name, "") for name in self.columns)
+
+    def translate(self, block: bytes) -> bytes:
+        """Return a block of lines as rows: one line each, empty where it is of another message."""
+        lead = f"{self.message},".encode()
+        lines = block.split(b"\n")
+        return b"\n".join([line[len(lead) :].lstrip() if line.startswith(lead) else b"" for line in lines])
+
+    def note(self) -> str:
+        """Say which message was taken."""
+        others = f", {', '.join(self.others)} left out; --line NAME takes others" if self.others else ""
+        return f"ArduPilot log: message {self.message} taken by its FMT line{others}"
+
+
+def find_messages(head: bytes, source: str, wanted: str | None = None) -> MessageFilter | None:
+    """Return the filter of an ArduPilot log, None for any other text.
+
+    Args:
+        head: first bytes; source: named in messages; wanted: name of the message to take, None to find it.
+
+    Raises:
+        DataError: a log without such a message.
+    """
+    formats = {
+        match[1].decode(): tuple(name.strip() for name in match[2].decode(errors="replace").split(","))
+        for match in _FORMAT.finditer(head)
+    }
+    if not formats:
+        return None
+    able = [name for name, columns in formats.items() if set(FORCE_COLUMNS) <= set(columns)]
+    able = [name for name in able if re.search(rb"^%s," % name.encode(), head, re.MULTILINE)]
+    able.sort(key=lambda name: MESSAGES.index(name) if name in MESSAGES else len(MESSAGES))
+    if wanted is None and not able:
+        raise DataError(
+            f"{source}: is an ArduPilot log without messages of acceleration (IMU or ACC); log them with LOG_BITMASK"
+        )
+    message = able[0] if wanted is None else wanted.strip(" ,")
+    if message not in formats:
+        raise DataError(
+            f'{source}: no FMT line defines a message "{message}" (--line); acceleration is in {" or ".join(able)}'
+        )
+    return MessageFilter(message, formats[message], tuple(name for name in able if name != message))
+
+
 def called(kind: LineKind) -> str:
     """Return how a message names a kind."""
-    lead = kind.lead.strip()
-    return f'"{lead}"' if lead else f"{len(kind.labels)} bare numbers"
+    return f'"{kind.name}"' if kind.name else f"{len(kind.labels)} bare numbers"
 
 
 def without_prefix(line: str, prefix: str) -> str | None:
-    """Return a line without its prefix, None for one that does not begin with it."""
+    """Return a line without its prefix, None for one that does not begin with it, or with a time and then with it."""
     text = line.lstrip()
-    return text[len(prefix) :] if text.startswith(prefix) else None
+    if text.startswith(prefix):
+        return text[len(prefix) :]
+    clock = _CLOCK.match(text)
+    rest = "" if clock is None else text[clock.end() :]
+    return f"{clock[1]} {rest[len(prefix) :]}" if clock is not None and rest.startswith(prefix) else None
 
 
 def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) -> LineFilter | None:
@@ -135,7 +227,7 @@ def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) ->
         prefix: of the lines to take, None for the kind that holds acceleration.
 
     Raises:
-        DataError: no line has the prefix, or several kinds may be acceleration.
+        DataError: no line has the prefix, several kinds may be acceleration, or each axis has a line of its own.
     """
     kept = lines
     if prefix is not None:
@@ -146,7 +238,12 @@ def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) ->
             raise DataError(f'{source}: no line begins with "{prefix}" (--line); there are {found}')
     kinds = _kinds(kept)
     able = [kind for kind in kinds if len(kind.labels) >= 3]
-    if prefix is None and not any(kind.lead.strip() or any(kind.labels) for kind in able):
+    if not able and sum(kind.share for kind in kinds if kind.name) > MOST_WORDED:
+        shown = ", ".join(called(kind) for kind in kinds[:SHOWN])
+        raise DataError(
+            f"{source}: no line has three numbers; lines are of the kinds {shown}; x, y and z have to stand in one line"
+        )
+    if prefix is None and not any(kind.name or any(kind.labels) for kind in able):
         return None
     chosen = [kind for kind in able if kind.acceleration] or able
     if not chosen:
@@ -155,20 +252,21 @@ def find_filter(lines: Sequence[str], source: str, prefix: str | None = None) ->
         shown = " or ".join(called(kind) for kind in chosen[:SHOWN])
         raise DataError(
             f"{source}: lines are of several kinds, and the readings could be {shown}; say which with --line, as in "
-            f'--line "{chosen[0].lead.strip() or "PREFIX"}"'
+            f'--line "{chosen[0].name or "PREFIX"}"'
         )
     return LineFilter(chosen[0], tuple(kinds), prefix or "")
 
 
 def _kinds(lines: Sequence[str]) -> list[LineKind]:
-    """Return the kinds of lines with numbers, the commonest first."""
+    """Return the kinds of lines with numbers, the commonest first, without those that occur once where others recur."""
     counts: dict[tuple[tuple[str, ...], int], tuple[int, str]] = {}
     for line in lines:
         words, values = _parts(line)
         key = tuple(words), len(values)
         if values:
             counts[key] = counts.get(key, (0, line))[0] + 1, counts.get(key, (0, line))[1]
-    least = max(1, RARE * len(lines))
+    often = max((count for count, _ in counts.values()), default=0)
+    least = max(2 if often > 2 else 1, RARE * len(lines))
     return [
         _kind(line, count / len(lines))
         for count, line in sorted(counts.values(), key=lambda item: -item[0])
@@ -179,6 +277,7 @@ def _kinds(lines: Sequence[str]) -> list[LineKind]:
 def _parts(line: str) -> tuple[list[str], list[str]]:
     """Return the words around the numbers of a line, one more than numbers, and the numbers as text."""
     words, values, at = [], [], 0
+    line = _CHECKSUM.sub("", line)
     for match in _VALUE.finditer(line):
         words.append(_normal(line[at : match.start()]))
         values.append(match[0])
@@ -191,6 +290,7 @@ def _normal(text: str) -> str:
 
 
 def _kind(line: str, share: float) -> LineKind:
+    line = _CHECKSUM.sub("", line)
     matches = list(_VALUE.finditer(line))
     labels: list[str] = []
     units: list[str] = []
@@ -212,5 +312,7 @@ def _kind(line: str, share: float) -> LineKind:
         units.append(tail[0] if tail and parse_unit(tail[0]) else "")
     if units and parse_unit(units[-1]) in FORCE_UNITS:  # one unit behind the last number is that of all
         units = [unit or units[-1] for unit in units]
-    lead = line[: matches[0].start()].strip()
-    return LineKind(lead, tuple(_parts(line)[0]), tuple(labels), tuple(units), share)
+    lead = name = line[: matches[0].start()].strip()
+    if not lead and matches[0]["clock"] and len(matches) > 1:
+        name = line[matches[0].end() : matches[1].start()].strip(" \t:>-")
+    return LineKind(lead, name, tuple(_parts(line)[0]), tuple(labels), tuple(units), share)

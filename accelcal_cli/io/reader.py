@@ -29,6 +29,7 @@ from accelcal_cli.io.dialect import (
     is_comment,
     looks_numeric,
     split_cells,
+    to_number,
     understand,
 )
 from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
@@ -79,8 +80,10 @@ class Selection:
     """Columns to read, counted from 0."""
 
     numbers: tuple[int, ...]
-    gaps: frozenset[int] = frozenset()  # columns whose cells may be empty or nan
-    texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
+    gaps: frozenset[int] = frozenset()  # columns whose cells may be empty, or nan where they are numbers
+    texts: tuple[
+        int, ...
+    ] = ()  # columns read as text: labels, which no row may lack unless they are among the gaps
     needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
     carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
 
@@ -192,6 +195,11 @@ class TextTable:
         self._lines = LineMap()
 
     @property
+    def translated(self) -> bool:
+        """Whether the rows are not the lines of the input but what was found in them."""
+        return self._words is not None
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the bytes read so far."""
         return self._source.sha256
@@ -199,7 +207,7 @@ class TextTable:
     @property
     def source_format(self) -> str:
         """How the text is written."""
-        form = "words" if self._words else SEPARATORS[self.dialect.separator]
+        form = SEPARATORS[self.dialect.separator] if self._words is None else self._words.form
         return ", ".join(
             ["text", form, *(["decimal comma"] * self.dialect.decimal_comma), *self._source.forms]
         )
@@ -212,16 +220,10 @@ class TextTable:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped, in sentences; complete once all blocks have been read."""
-        above, facts = self.dialect.above, str(self.facts)
         notes = [f"read as {' in '.join(reversed(self._source.forms))}"] * bool(self._source.forms)
         if self._options.skip_rows:
             notes.append(f"the first {self._options.skip_rows:,} lines skipped (--skip-rows)")
-        if above or facts:
-            plural = "s" * (above != 1)
-            notes.append(
-                (f"{above:,} line{plural} above the table skipped" if above else "comments")
-                + f": {facts}" * bool(facts)
-            )
+        notes += self.dialect.notes()
         if self._words is not None and (note := self._words.note()):
             notes.append(note)
         return (*notes, *self.passed.notes())
@@ -234,6 +236,8 @@ class TextTable:
         """Return the cells of some rows of the head that are read, spread over it."""
         head = self._source.head if self._words is None else self._words.translate(self._source.head)
         lines = head.splitlines()[self.dialect.top :]
+        if self._words is not None:
+            lines = [line for line in lines if line]
         step = max(1, len(lines) // (2 * SAMPLE)) if len(lines) > 2 * SAMPLE else 1
         texts = [line.decode(errors="replace") for line in lines[::step]]
         rows = (
@@ -333,7 +337,7 @@ class CarefulParser:
                 text.append(label)
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
-        return RowBlock(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+        return RowBlock(start, numbers.reshape(self.row - start, len(self.selection.numbers)), texts)
 
     def _few_are_broken(self, lines: Iterable[bytes]) -> bool:
         """Return whether --skip-bad would leave out this row, going by the rows so far and the next lines."""
@@ -428,7 +432,7 @@ class CarefulParser:
         raise DataError(f"{self._place(column)}: {_describe_cell(cell, value, self.dialect.decimal_comma)}")
 
     def _label(self, cell: str, column: int) -> str:
-        if cell:
+        if cell or column in self.selection.gaps:
             return cell
         raise DataError(f"{self._place(column)}: {NO_LABEL}")
 
@@ -491,10 +495,11 @@ class FastParser:
         numbers = np.array(
             [column.to_numpy() for column in series]
         ).T  # column after column: faster to reduce
-        if not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
+        if series and not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
             return None
-        texts = tuple([(cell or "").strip() for cell in frame[str(k)].to_list()] for k in selection.texts)
-        return RowBlock(self.careful.skip(len(frame)), numbers, texts) if all(map(all, texts)) else None
+        texts = tuple(frame[str(k)].str.strip_chars().fill_null("").to_list() for k in selection.texts)
+        whole = all(k in selection.gaps or all(text) for k, text in zip(selection.texts, texts, strict=True))
+        return RowBlock(self.careful.skip(len(frame)), numbers, texts) if whole else None
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl
@@ -519,17 +524,6 @@ class FastParser:
             quoted or _count(block, dialect.separator) != (dialect.width - 1) * len(frame)
         )
         return None if broken or short else frame
-
-
-def to_number(cell: str, decimal_comma: bool) -> float | None:
-    """Return the value of a cell, None where it is not a number. Stricter than float(): no 1_000, no foreign digits."""
-    thousands = decimal_comma and "." in cell  # 1.234,5 and 1.234
-    if thousands or "_" in cell or not cell.isascii():
-        return None
-    try:
-        return float(cell.replace(",", ".", 1) if decimal_comma else cell)
-    except ValueError:
-        return None
 
 
 def shorten(text: str) -> str:

@@ -20,7 +20,7 @@ from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, are_no_counts, choose, restrict
 from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, open_table
-from accelcal_cli.io.rows import OneSensor, RowBlock, ZeroRows
+from accelcal_cli.io.rows import DeadColumns, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 from accelcal_cli.notices import Notice
@@ -361,6 +361,8 @@ class Collector:
             )
         advice = "; the sensor has to be turned between them"
         self._refuse_equal(f"all {self.store.rows:,} readings are equal", advice)
+        if not self._all:
+            DeadColumns(self.source, self.columns.names, self.lower, self.upper, self.rows).check()
 
     def _widen(self, output: Float) -> None:
         self.lower = np.minimum(self.lower, [axis.min() for axis in output.T])

@@ -53,12 +53,15 @@ class Change:
 def rewrite(table: TextTable, change: Change, file: IO[bytes]) -> None:
     """Write the changed log in constant memory: a block is written in the background while the next is parsed.
 
+    Of lines with words, or of several kinds, the rows that were found in them are written, below a header.
+
     Raises:
         DataError: a cell that is wrong, by its line and column.
         OSError: the file cannot be written.
     """
-    lines, writing = _LineWriter(table.dialect, change), BackgroundThread()
+    lines, writing = _LineWriter(table.dialect, change, translated=table.translated), BackgroundThread()
     try:
+        file.write(lines.header())
         for block, rows in table.pairs(change.selection):
             lines.passed.update(table.passed.lines())
             writing.start(partial(lines.write, block, change.compute(rows.numbers), file))
@@ -69,13 +72,20 @@ def rewrite(table: TextTable, change: Change, file: IO[bytes]) -> None:
 class _LineWriter:
     """Writes blocks of whole lines, and keeps count of lines across blocks."""
 
-    def __init__(self, dialect: Dialect, change: Change) -> None:
-        self.dialect, self.change = dialect, change
+    def __init__(self, dialect: Dialect, change: Change, *, translated: bool) -> None:
+        self.dialect, self.change, self.translated = dialect, change, translated
         self.line = 0
         self.passed: set[int] = set()  # lines that are no rows
         self.glue = dialect.separator.encode()
         self.titled = dialect.names is None or dialect.header_line > 0
         self.quoted = dialect.decimal_comma and dialect.separator == ","
+
+    def header(self) -> bytes:
+        """Return the header of rows that were found in lines, nothing for lines that stay."""
+        if not self.translated or self.dialect.names is None:
+            return b""
+        names = self.glue.join(name.encode() for name in self.dialect.names)
+        return self._changed(names, [name.encode() for name in self.change.names]) + b"\n"
 
     def write(self, block: bytes, values: Float, file: IO[bytes]) -> None:
         """Write the changed block: by polars where every line is a plain row, else line by line."""
@@ -143,6 +153,8 @@ class _LineWriter:
             self.line += 1
             line = raw.rstrip(b"\r\n")
             text = line.removeprefix(BOM).decode(errors="replace").lstrip()
+            if self.translated and is_blank(text):
+                continue
             if self.line == self.dialect.header_line:
                 line = self._changed(line, [name.encode() for name in self.change.names])
             elif is_comment(text, self.dialect.marks):

@@ -51,6 +51,12 @@ SMALL = 1 << 18
 SHOWN = 6
 """Rows, poses or values that a sentence names at most."""
 
+FEWEST_DEAD = 4
+"""Rows from which on two columns that never change are dead."""
+
+MOVES = 0.1
+"""Part of the largest reading by which the third column changes, then."""
+
 MOST_SENSORS = 1000
 """A column with more values does not label sensors."""
 
@@ -418,6 +424,45 @@ class OneSensor:
         return (
             f'{self.table.name}: column "{name}" has {len(values)} values ({shown}): these are readings of several '
             f"sensors; choose one with --where {shlex.quote(f'{name}={best}')}{many}"
+        )
+
+
+@dataclass
+class DeadColumns:
+    """Refuses readings of which two columns never change while the third does: gravity cannot turn so.
+
+    Attributes:
+        source: named in messages; names: of the three columns.
+        lower, upper: least and greatest readings, shape (3,); rows: looked at.
+    """
+
+    source: str
+    names: Sequence[str]
+    lower: Float = field(default_factory=lambda: np.full(3, np.inf))
+    upper: Float = field(default_factory=lambda: np.full(3, -np.inf))
+    rows: int = 0
+
+    def add(self, output: Float) -> None:
+        """Look at rows (B, 3), as long as two columns may be dead."""
+        if len(output) and np.count_nonzero(self.lower < self.upper) < 2:
+            self.rows += len(output)
+            self.lower = np.minimum(self.lower, output.min(axis=0))
+            self.upper = np.maximum(self.upper, output.max(axis=0))
+
+    def check(self) -> None:
+        """Raise DataError at the end of the rows."""
+        dead = [k for k in range(3) if self.lower[k] == self.upper[k]]
+        span = float(np.max(self.upper - self.lower))
+        if self.rows < FEWEST_DEAD or len(dead) != 2:
+            return
+        if span <= MOVES * max(np.abs(self.lower).max(), np.abs(self.upper).max()):
+            return
+        shown = " and ".join(f'"{self.names[k]}"' for k in dead)
+        held = " and ".join(f"{self.lower[k]:g}" for k in dead)
+        other = self.names[3 - sum(dead)]
+        raise DataError(
+            f'{self.source}: columns {shown} never change ({held} in all rows) while "{other}" does: they are dead '
+            "axes, or no axes of the accelerometer; check the sensor, or say which columns are x, y, z with --columns"
         )
 
 

@@ -6,14 +6,15 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError
-from accelcal_cli.io.lines import find_filter
+from accelcal_cli.io.lines import LineFilter, find_filter
+from accelcal_cli.io.vocabulary import recognise
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -28,7 +29,10 @@ PATIENCE = 100
 SHOWN = 60
 """Characters of a line that a message shows."""
 
-FIRST = 12
+FEWEST, EVEN = 6, 4.0
+"""Readings that show whether the first number is time, and the ratio of its steps at most."""
+
+FIRST = 24
 """Lines that show whether they are of several kinds."""
 
 _CLOCK = re.compile(r"(?<![\w.:])\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?:\s*->)?(?![\w:])")
@@ -90,7 +94,7 @@ def _open(name: str, baud: int, timeout: float) -> Serial:
 
 def readings(
     lines: Iterable[bytes],
-    columns: Sequence[int],
+    columns: Sequence[int] | None,
     source: str,
     prefix: str | None = None,
     tell: Callable[[str], None] = lambda _: None,
@@ -100,7 +104,8 @@ def readings(
     Where the first lines are of several kinds, those of acceleration are read, as from files.
 
     Args:
-        lines: as they arrive; columns: which numbers, from 0; source: named in messages.
+        lines: as they arrive; source: named in messages.
+        columns: which numbers, from 0; None for those that their words name, else the first three.
         prefix: what the lines of readings begin with, None to find them by their words.
         tell: is told which kind of lines is taken.
 
@@ -111,6 +116,13 @@ def readings(
     texts = (text for text in texts if text)
     first = list(islice(texts, FIRST))
     kinds = find_filter(first, source, prefix) if prefix is not None or _are_mixed(first) else None
+    if kinds is None and columns is None:
+        kinds = _named(first, source)
+    named = _axes(kinds) if columns is None else None
+    if columns is None and _are_timed(first, kinds):
+        columns = range(1, 4)
+        tell(f"{source}: the first number of each line taken as time: it increases")
+    columns = columns or range(3)
     if kinds is not None and (note := kinds.note()):
         tell(f"{source}: {note}")
     unread = 0
@@ -121,7 +133,8 @@ def readings(
                 unread += 1
                 _check_unread(unread, source, columns, text)
                 continue
-            text = " ".join(value for value in values if ":" not in value)
+            chosen = values if named is None else [values[k] for k in named]
+            text = " ".join(value for value in chosen if ":" not in value)
         elif text.startswith("#"):
             continue
         else:
@@ -135,9 +148,37 @@ def readings(
 
 def _are_mixed(lines: Sequence[str]) -> bool:
     """Return whether words at their beginning tell lines of several kinds apart, or all seem to be comments."""
-    found = [line for line in lines if _LEAD.match(line)]
+    bare = (_CLOCK.sub("", line).lstrip() for line in lines)
+    found = [line for line in bare if _LEAD.match(line)]
     leads = {_LEAD.match(line)[0] for line in found}  # type: ignore[index]
     return len(leads) > 1 or (bool(found) and all(line.startswith("#") for line in lines))
+
+
+def _named(lines: Sequence[str], source: str) -> LineFilter | None:
+    """Return the kind of lines whose words name x, y, z, None where there is none."""
+    with suppress(DataError):  # then they are read as numbers in a row
+        kinds = find_filter(lines, source)
+        return kinds if _axes(kinds) else None
+    return None
+
+
+def _are_timed(lines: Sequence[str], kinds: LineFilter | None) -> bool:
+    """Return whether the first of four or seven numbers is time: it increases, in steps of about one size."""
+    if kinds is not None:
+        lines = [" ".join(kinds.values(line) or ()) for line in lines]
+    rows = [row for line in lines if (row := numbers(_CLOCK.sub("", line)))]
+    steps = [other[0] - one[0] for one, other in pairwise(rows)]
+    even = len(rows) >= FEWEST and 0 < max(steps) <= EVEN * min(steps)
+    return even and all(len(row) in (4, 7) for row in rows)
+
+
+def _axes(kinds: LineFilter | None) -> Sequence[int] | None:
+    """Return which numbers of a line are acceleration by their names, None where these do not say."""
+    if kinds is None or kinds.kind.names is None:
+        return None
+    roles = recognise(kinds.kind.names)
+    families = list((roles.families or roles.described).values())
+    return families[0] if len(families) == 1 else None
 
 
 def _check_unread(unread: int, source: str, columns: Sequence[int], text: str) -> None:

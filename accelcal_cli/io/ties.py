@@ -23,6 +23,9 @@ CHANCE = 5e-4
 DIGITS = 12
 """Digits to which values are compared: the mean of equal readings is off by rounding."""
 
+ROUNDING = 1e-9
+"""Part of the range below which noise is rounding: no accelerometer is as quiet."""
+
 FEWEST = 12
 """Poses that show the noise: a quadric has nine parameters."""
 
@@ -191,7 +194,7 @@ class Ties:
         """
         if surface is None:
             return np.ones(3)
-        step = np.maximum(self.steps, 1e-12 * np.abs(self.output).max(axis=0))
+        step = np.maximum(self.steps, ROUNDING * np.ptp(self.output, axis=0))
         noise = np.maximum(surface.noise, 1e-300)
         # The difference of two normal readings has a density of 1 / (2 sqrt(pi) sigma) at zero.
         return np.where(noise < step, 1.0, np.minimum(1.0, step / (2 * math.sqrt(math.pi) * noise)))
@@ -206,7 +209,7 @@ class Ties:
         if self.surface is None:
             return 0.5 * len(self.output) ** 2
         width = NEAR * np.maximum(
-            np.maximum(self.surface.noise, self.steps), 1e-9 * np.ptp(self.output, axis=0)
+            np.maximum(self.surface.noise, self.steps), ROUNDING * np.ptp(self.output, axis=0)
         )
         cells = np.round(self.output / width)
         _, count = np.unique(cells, axis=0, return_counts=True)
@@ -217,6 +220,8 @@ class Ties:
         if len(self.output) < FEWEST:
             return
         change = np.abs(np.diff(self.output, axis=0))
+        if not (change == 0).any():  # spares the search for the steps
+            return
         turned = np.stack([np.delete(change, i, axis=1).max(axis=1) for i in range(3)], axis=1)
         alive, turned = turned > ALIVE * self.steps.max(), turned > self._shortest_turn()
         for axis, values in enumerate(self.output.T):

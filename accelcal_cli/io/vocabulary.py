@@ -24,6 +24,7 @@ AXES = "xyz"
 
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]")
 _ALL_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
+_ZONE = re.compile(r",?\s*(?:GMT|UTC)\s*[+-]\d\d:?\d\d\s*$")  # Date Time, GMT-05:00
 _INDEX = re.compile(r"\[([012])\]\s*$")  # accelerometer_m_s2[0]
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _UNIT_WORDS = re.compile(
@@ -31,89 +32,36 @@ _UNIT_WORDS = re.compile(
 )
 MEAN = frozenset({"mean", "avg", "average", "moyenne", "mittelwert"})
 
-UNITS: dict[str, tuple[Quantity, tuple[str, ...]]] = {
+UNITS: dict[str, tuple[Quantity, str]] = {
     "m/s^2": (
         "acceleration",
-        (
-            *(
-                "m/s2",
-                "m/s/s",
-                "ms-2",
-                "m*s-2",
-                "m.s-2",
-                "m/(s2)",
-                "m/sec2",
-                "mps2",
-                "ms2",
-                "m/s**2",
-                "m/(s2",
-                "m_s2",
-            ),
-            *("meter/s2", "meters/s2", "meterspersecondsquared", "metrespersecondsquared"),
-        ),
+        "m/s2 m/s/s ms-2 m*s-2 m.s-2 m/(s2) m/sec2 mps2 ms2 m/s**2 m/(s2 m_s2 meter/s2 "
+        "meters/s2 meterspersecondsquared metrespersecondsquared",
     ),
-    "g": ("acceleration", ("g", "gs", "g0", "gn", "gforce", "g's", "standardgravity")),
-    "mg": ("acceleration", ("mg", "milli-g", "millig", "mgs")),
-    "counts": ("other", ("lsb", "lsbs", "counts", "count", "raw", "adc", "digits", "ticks", "bits", "cts")),
-    "turning": (
-        "turning",
-        ("rad/s", "rads-1", "deg/s", "degs-1", "dps", "°/s", "mdps", "rad/sec", "deg/sec", "grad/s"),
-    ),
-    "magnetic": (
-        "magnetic",
-        ("ut", "mt", "nt", "gauss", "mgauss", "mga", "ga", "uteslas", "microtesla", "localflux"),
-    ),
-    "s": ("time", ("s", "sec", "secs", "second", "seconds", "sekunden", "secondes")),
-    "ms": ("time", ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds", "millisec")),
-    "us": ("time", ("us", "usec", "usecs", "micros", "microsecond", "microseconds")),
-    "ns": ("time", ("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds")),
-    "min": ("time", ("min", "mins", "minute", "minutes", "minuten")),
-    "h": ("time", ("h", "hr", "hrs", "hour", "hours")),
-    "d": ("time", ("d", "day", "days", "tage", "jours", "datenum", "matlab", "excel")),
-    "degC": (
-        "temperature",
-        ("c", "degc", "°c", "celsius", "k", "kelvin", "degf", "f", "degreescelsius", "degrees"),
-    ),
+    "g": ("acceleration", "g gs g0 gn gforce g's standardgravity"),
+    "mg": ("acceleration", "mg milli-g millig mgs"),
+    "counts": ("other", "lsb lsbs counts count raw adc digits ticks bits cts"),
+    "turning": ("turning", "rad/s rads-1 deg/s degs-1 dps °/s mdps rad/sec deg/sec grad/s"),
+    "magnetic": ("magnetic", "ut mt nt gauss mgauss mga ga uteslas microtesla localflux"),
+    "s": ("time", "s sec secs second seconds sekunden secondes"),
+    "ms": ("time", "ms msec msecs millis millisecond milliseconds millisec"),
+    "us": ("time", "us usec usecs micros microsecond microseconds"),
+    "ns": ("time", "ns nsec nsecs nanos nanosecond nanoseconds"),
+    "min": ("time", "min mins minute minutes minuten"),
+    "h": ("time", "h hr hrs hour hours"),
+    "d": ("time", "d day days tage jours datenum matlab excel"),
+    "degC": ("temperature", "c degc °c celsius k kelvin degf f degreescelsius degrees"),
     "-": (
         "other",
-        (
-            *(
-                "-",
-                "nounits",
-                "none",
-                "nounit",
-                "unitless",
-                "cal",
-                "uncal",
-                "v",
-                "mv",
-                "hz",
-                "pa",
-                "hpa",
-                "kpa",
-            ),
-            *(
-                "deg",
-                "rad",
-                "°",
-                "lux",
-                "%",
-                "kohms",
-                "ua",
-                "mbar",
-                "m",
-                "m/s",
-                "n/a",
-                "a.u.",
-                "yyyy/mm/dd",
-                "hh:mm:ss",
-            ),
-        ),
+        "- nounits none nounit unitless cal uncal v mv hz pa hpa kpa deg rad ° lux % "
+        "kohms ua mbar m m/s n/a a.u. yyyy/mm/dd hh:mm:ss",
     ),
 }
 """Spellings of units by what they stand for; the canonical name comes first."""
 
-_SPELLED = {word: name for name, (_, words) in UNITS.items() for word in words}
+TIME_UNITS = frozenset(name for name, (quantity, _) in UNITS.items() if quantity == "time")
+
+_SPELLED = {word: name for name, (_, words) in UNITS.items() for word in words.split()}
 
 FORCE_UNITS = ("g", "mg", "m/s^2")
 """Units of acceleration that say what 1 g is."""
@@ -258,6 +206,11 @@ class Meaning:
     axis: int | None = None
     number: int | None = None
 
+    @property
+    def is_axis(self) -> bool:
+        """Whether it is an axis, be it by a number of an acceleration."""
+        return self.axis is not None or (self.number is not None and self.quantity == "acceleration")
+
 
 @lru_cache(maxsize=4096)
 def parse_unit(text: str) -> str | None:
@@ -270,7 +223,8 @@ def parse_unit(text: str) -> str | None:
 
 def name_unit(name: str) -> str | None:
     """Return the unit in the name of a column, ``g`` for ``ax_g`` and ``gFx``; None where there is none."""
-    for text in reversed(_BRACKETS.findall(name)):
+    behind_comma = re.findall(r",\s*([^,(\[]+?)\s*(?:[(\[]|$)", name)  # X Accel, g (LGR S/N: 10271234)
+    for text in reversed(behind_comma + _BRACKETS.findall(name)):
         if unit := parse_unit(text):
             return unit
     bare = plain(_INDEX.sub("", name))
@@ -328,7 +282,7 @@ def tokens_of(name: str) -> list[str]:
 
 def is_time(name: str) -> bool:
     """Return whether a column is time by its name: t, Zeit (s), timestamp_ms, S_Timestamp_Unix_CAL."""
-    words = tokens_of(name)
+    words = tokens_of(_ZONE.sub("", name))
     while words and words[0] in (
         "s",
         "sensor",
@@ -430,11 +384,12 @@ def recognise(names: Sequence[str]) -> Roles:
     for column, name in enumerate(names):
         words = tokens_of(name)
         key = "".join(words)
-        if _TIME.fullmatch(key) or is_time(name):
+        timed = parse_unit(next(reversed(_BRACKETS.findall(name)), "")) in TIME_UNITS
+        if timed or _TIME.fullmatch(key) or is_time(name):
             roles.alone["time"].append(column)
         if _SENSOR_PERHAPS.fullmatch(key):
             roles.alone["perhaps sensor"].append(column)
-        if role := _role(name, key):
+        if role := _role(name, key) or ("other" if timed else None):
             roles.alone[role].append(column)
             continue
         if axis := _spread(words, key):

@@ -15,6 +15,7 @@ from accelcal_cli.detection.detect import DetectSettings, detect
 from accelcal_cli.detection.rawlog import open_raw_log
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.reader import PLAIN, ReadOptions
+from accelcal_cli.io.readings import read_readings
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import directions
 
@@ -28,7 +29,10 @@ LM = Settings("levenberg-marquardt", weights="auto")
 
 @dataclass(frozen=True)
 class Case:
-    """A log, local gravity in its unit, output of 1 m/s^2 over that of K, and what has to be said of it."""
+    """A log, local gravity in its unit, output of 1 m/s^2 over that of K, and what has to be said of it.
+
+    An `ideal` one is of a sensor without errors.
+    """
 
     name: str
     g: float | None = None
@@ -36,6 +40,7 @@ class Case:
     options: ReadOptions = PLAIN
     said: str = ""
     refused: str = ""
+    ideal: bool = False
 
 
 CASES = (
@@ -53,6 +58,13 @@ CASES = (
     Case("glitch.csv", options=ReadOptions(skip_bad=True), said="line 3002", refused="line 3002"),
     Case("restart.csv", said="the header is repeated and left out: line 5002"),
     Case("cut.csv", said="the last line, 9,813, left out"),
+    Case("serial_bursts.csv", ideal=True, said="the rate is that of rows over span, 100 rows"),
+    Case(
+        "long.csv",
+        options=ReadOptions(where=("sensor=accelerometer",)),
+        said="time taken as ms: 100 rows per second",
+        refused="--where sensor=accelerometer",
+    ),
     Case("serial_adafruit.txt", said='"Acceleration X:" taken'),
     Case("serial_razor.txt", 1.0, 256, said='"#A-R=" taken'),
 )
@@ -68,10 +80,10 @@ def calibrated(source, stdin=None, g=None, options=PLAIN):
     return calibrate(found.readings(), Settings("levenberg-marquardt", g=local, weights="auto")), found
 
 
-def assert_truth(result, scale=1.0):
+def assert_truth(result, scale=1.0, ideal=False):
     lower = np.tril_indices(3)
-    bias = D if result.g > 2 else D / STANDARD_GRAVITY
-    away = np.abs(result.K_a - scale * K)[lower] / result.sigma.K_a[lower]
+    truth, bias = (np.eye(3), np.zeros(3)) if ideal else (K, D if result.g > 2 else D / STANDARD_GRAVITY)
+    away = np.abs(result.K_a - scale * truth)[lower] / result.sigma.K_a[lower]
     assert away.max() < SIGMAS
     assert (np.abs(result.D_a - scale * bias) / result.sigma.D_a).max() < SIGMAS
 
@@ -85,8 +97,25 @@ def test_a_log_of_a_device_gives_its_sensor(case):
         with pytest.raises(DataError, match=case.refused):
             calibrated(path, g=case.g)
     result, found = calibrated(path, g=case.g, options=case.options)
-    assert_truth(result, case.scale)
+    assert_truth(result, case.scale, case.ideal)
     assert any(case.said in note for note in found.notes), found.notes
+
+
+CASE_FILES = Path(__file__).parents[3] / "shared" / "cases"
+
+
+@pytest.mark.skipif(not CASE_FILES.is_dir(), reason="needs ../shared/cases")
+def test_the_log_that_warms_keeps_the_temperature_of_each_pose():
+    result, found = calibrated(CASE_FILES / "temperature_log.csv")
+    assert (np.diff(found.intervals.temperature) > 0.5).all()
+    assert any("Temperature column not used: 14 poses are too few" in note for note in result.notes)
+
+
+@pytest.mark.skipif(not CASE_FILES.is_dir(), reason="needs ../shared/cases")
+def test_a_running_number_is_no_count():
+    readings = read_readings(CASE_FILES / "running_number_samples.csv")
+    assert readings.count is None
+    assert 'column "n_samples" numbers the rows, so it is no count' in readings.notes
 
 
 def simulated_rows(rate=50.0, seed=4):
@@ -134,6 +163,7 @@ STAMPS = {
     "Excel days": lambda t: f"{45637.5 + t / 86400000:.9f}",
     "MATLAB days": lambda t: f"{739597.5 + t / 86400000:.9f}",
     "millis": lambda t: str(5000 + t),
+    "durations": lambda t: f"{t / 1000:.2f} sec",
 }
 
 

@@ -132,6 +132,9 @@ def read(text: str, **options: object) -> Readings:
         "100\nax,ay,az\n",
         "1544027283.0,1544027283.0,1544027283.0\n32.0,32.0,32.0\n",
         "Accelerometer,,\nx,y,z\n",
+        "*NAME\nLogger 7\n\n*CHANNEL\nax,ay,az\n\n*UNIT\nm/s^2,m/s^2,m/s^2\n*DATA\n",
+        "Channels,3,,\nSamples,14,14,14\nDate,a,b,c\nX0,0,0,0\nDelta,1,1,1\n***End***,,,\nax,ay,az,Comment\n",
+        '"ax, GMT-05:00","ay, g (S/N: 1)","az, g (S/N: 1)"\n',
     ],
 )
 def test_what_stands_above_a_table_is_no_row(above: str) -> None:

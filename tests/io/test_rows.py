@@ -1,14 +1,15 @@
-"""`--where COLUMN=VALUE`: which rows are read, and that their lines keep their numbers."""
+"""Which rows are read, by `--where COLUMN=VALUE`; that lines keep their numbers; columns that never change."""
 
 import io
 
 import numpy as np
 import pytest
 
+from accelcal_cli.detection.rawlog import open_raw_log
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import restrict
 from accelcal_cli.io.reader import ReadOptions, Selection, open_table
-from accelcal_cli.io.readings import read_readings
+from accelcal_cli.io.readings import Readings, read_readings
 
 TABLE = """# two sensors
 device,ax,ay,az
@@ -187,3 +188,31 @@ def test_a_number_of_its_own_for_each_row_is_no_sensor(tmp_path):
     rows = np.random.default_rng(3).normal(size=(24, 3)).tolist()
     path.write_text("sn,ax,ay,az\n" + "\n".join(f"{k},{a},{b},{c}" for k, (a, b, c) in enumerate(rows)))
     assert read_readings(path).poses == 24
+
+
+TURNS = np.round(9.8 * np.cos(np.arange(12)), 3)
+
+
+def test_two_columns_that_never_change_are_refused() -> None:
+    rows = "".join(f"{x},0.12,9.81,{k}\n" for k, x in enumerate(TURNS))
+    seen = r'columns "ay" and "az" never change \(0\.12 and 9\.81 in all rows\) while "ax" does: .* with --columns'
+    with pytest.raises(DataError, match=seen):
+        read_readings("-", stdin=io.BytesIO(("ax,ay,az,u\n" + rows).encode()))
+    log = open_raw_log("-", stdin=io.BytesIO(("ax,ay,az,u\n" + rows * 50).encode()))
+    with pytest.raises(DataError, match=seen):
+        list(log.blocks())
+    with pytest.raises(DataError, match=r'columns "1" and "3" never change'):
+        Readings.from_array(np.column_stack([np.zeros(12), TURNS, np.ones(12)]))
+
+
+def test_columns_that_change_late_or_little_are_not_refused() -> None:
+    late = np.column_stack([TURNS, np.zeros(12), np.r_[np.zeros(11), 5.0]])
+    assert Readings.from_array(late).poses == 12
+    still = np.column_stack(
+        [np.zeros(12), np.zeros(12), 64 + np.arange(12) % 3]
+    )  # a coarse sensor in one pose
+    assert Readings.from_array(still).poses == 12
+    rows = np.r_[np.repeat([[9.0, 0, 0]], 900, axis=0), np.repeat([[-9.0, 1, 1]], 900, axis=0)]
+    text = "ax,ay,az\n" + "".join(f"{x},{y},{z}\n" for x, y, z in rows)
+    log = open_raw_log("-", stdin=io.BytesIO(text.encode()))
+    assert sum(map(len, log.blocks())) == 1800
