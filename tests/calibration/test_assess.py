@@ -209,7 +209,7 @@ def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio
     for freedom, severity in ((3, "warning"), (4, "note")):
         said = assess.more_than_noise(ratio, chance, freedom)
         assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
-        assert {line.severity for line in said} <= {severity}
+        assert {line.severity for line in said} <= {severity if chance < 1e-5 else "note"}
 
 
 @pytest.mark.parametrize("part", [0.01, 0.03])
