@@ -509,7 +509,7 @@ def more_than_noise(ratio: float, chance: float, freedom: int) -> tuple[Notice, 
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
         "moved in them, changed its temperature or is not linear."
     )
-    if freedom <= FEW_TO_CHECK:
+    if freedom <= FEW_TO_CHECK and chance <= SURELY / 100:
         text += (
             f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
         )

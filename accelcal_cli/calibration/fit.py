@@ -50,9 +50,10 @@ EDGE = 1e-6
 NOTABLE_BIAS = 0.05
 """Sigmas of a parameter from which on the noise bias is taken off."""
 
-KNOWN_BIAS, SUPPOSED_BIAS = 0.1, 0.4
-"""Part of the noise bias that may remain: of noise known from repeated readings the formula is right to a tenth; that
-of single readings is supposed to be alike on all axes."""
+KNOWN_BIAS, UNALIKE = 0.1, 0.6
+"""What may remain of the noise bias: the formula is right to a tenth. That of single readings is supposed to be alike
+on all axes; for any attitudes that adds UNALIKE (s/g) sqrt(J) sigma, and 2 to 3 times as much where one axis is twice
+as noisy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +308,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     R = solution.plain.triangle.R
     ones = (nine.design(x).swapaxes(1, 2) @ R[:, :, 10:])[..., 0]  # the last column is of ones, compressed
     bias = -isotropic_bias(ones, variance, cofactor, g)
-    part = np.full(len(bias), SUPPOSED_BIAS)
+    unalike = UNALIKE * np.sqrt(variance * solution.sample.poses) / g
     if noise is not None and noise.known.any():
         u = directions(solution.sample, point.lower, point.D)
         w = solution.sample.each_weight(solution.stated.weights)
@@ -317,7 +318,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
         with np.errstate(divide="ignore", invalid="ignore"):
             own = own * np.fmin(1.0, variance / expected)[:, None]
         bias = np.where(noise.known[:, None], own, bias)
-        part = np.where(noise.known, KNOWN_BIAS, part)
+        unalike = np.where(noise.known, 0.0, unalike)
     sigma = np.sqrt(variance[:, None] * np.einsum("rpp->rp", cofactor))
     with np.errstate(divide="ignore", invalid="ignore"):
         notable = (np.abs(bias) > NOTABLE_BIAS * sigma).any(axis=1) & (np.abs(bias) < 0.1 * g).all(axis=1)
@@ -335,7 +336,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
         K=K,
         D=np.where(notable[:, None], D, point.D),
         lower=np.where(square, lower, point.lower),
-        bias=part[:, None] * np.abs(taken),
+        bias=np.where(square[..., 0], KNOWN_BIAS * np.abs(taken) + unalike[:, None] * sigma, 0.0),
     )
 
 
