@@ -233,7 +233,7 @@ def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:
     if not lines:
         raise DataError(f"{source}: is empty; readings were expected, one row per pose")
     texts = [text for _, text in lines]
-    dense = _dense(texts[1:] or texts)[-SAMPLED:]
+    dense = _dense((texts[1:] or texts)[-4 * SAMPLED :])[-SAMPLED:]
     separator = _separator(dense)
     if separator == " " and _names_tabs(texts, dense):
         separator = "\t"
