@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.problem import Box, Loetters, pack
-from accelcal_cli.calibration.triangle import compress
+from accelcal_cli.calibration.problem import Box, Loetters, compress, pack
 from accelcal_cli.sensor.poses import fibonacci
 from accelcal_cli.sensor.simulation import load_sensor, simulate
 from benchmarks.clock import pairs, report

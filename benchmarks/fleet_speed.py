@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.problem import pack, unpack
-from accelcal_cli.calibration.triangle import compress_each, fit_ellipsoid
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid, pack, unpack
 from accelcal_cli.sensor.poses import faces_edges
 from accelcal_cli.sensor.simulation import load_sensor, simulate_fleet
 from benchmarks.clock import pairs, process, report

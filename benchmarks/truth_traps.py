@@ -383,11 +383,15 @@ def wobbling(scene: Scene) -> Pair:
 
 
 def flicker(scene: Scene) -> Pair:
-    """Noise whose power falls as 1/f; honest: white noise of the same size. Labelled poses or rows, in turn."""
+    """Noise whose power falls as 1/f; honest: white noise of the same size. Labelled poses or rows, in turn.
+
+    Its mean over the session is a bias, of which no reading tells a part from the rest: it is that of the sensor.
+    """
     f, z = held(scene, spread(scene.rng, scene.count))
     n = len(f)
     spectrum = np.fft.rfft(scene.rng.normal(size=(n, 3)), axis=0)
     spectrum /= np.sqrt(np.maximum(np.arange(len(spectrum)), 1))[:, None]
+    spectrum[0] = 0.0
     pink = np.fft.irfft(spectrum, n, axis=0)
     pink *= scene.noise / pink.std(axis=0)
     labels = scene.labels() if scene.rng.integers(2) else None

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from accelcal_cli.calibration.problem import Box, Loetters
-from accelcal_cli.calibration.triangle import compress_each
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor.model import ErrorModel

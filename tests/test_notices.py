@@ -23,7 +23,7 @@ from accelcal_cli.detection.intervals import Intervals
 from accelcal_cli.detection.log_screening import Liveliness, alternating
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.io.rows import zero_rows
-from accelcal_cli.io.screening import Screened
+from accelcal_cli.io.screening import NOTHING, Screened
 from accelcal_cli.notices import COMMAND, Notice, are_serious, in_one
 from accelcal_cli.sensor import poses
 
@@ -31,7 +31,7 @@ KEYS = {
     *("log", "several-sensors", "duplicate-rows", "zero-rows", "frozen", "clipped", "gravity-removed"),
     *("never-moved", "wrong-gravity", "outliers", "large-misalignment", "residuals", "noise-bias", "tremor"),
     *("correlated", "unequal-noise", "few-attitudes", "box", "thousands", "dead-axis", "unfinished-search"),
-    *("perpendicular", "negative-axes", "legacy", "unit", "suspect-result"),
+    *("perpendicular", "negative-axes", "legacy", "unit", "suspect-result", "quantised", "drift"),
 }
 """Those that programs may rely on."""
 
@@ -100,6 +100,7 @@ def _screened():
         *of(np.clip(DPSO.output(G * TURNS), -5.4e6, 5.4e6)),
         *of(fine, scatter=scatter, count=count),
         *of(fine, scatter=alone, count=count),
+        *of(coarse, scatter=np.zeros((96, 3)), count=np.full(96, 9.0), behind=NOTHING.and_also(coarse, 96)),
         *of(other),
         *zero_rows(2, "line 3", 20),
         *zero_rows(30, "line 3", 20),
@@ -132,7 +133,7 @@ def _all():
         *_screened_log(),
         *(n for loss in ("plain", "robust", "known") for n in assess.not_fitting(["line 2"], 15, loss)),
         *assess.large_residuals(1.0, G, 100),
-        *assess.more_than_noise(9.0, 1e-9),
+        *(n for freedom in (3, 15) for n in assess.more_than_noise(9.0, 1e-9, freedom)),
         *assess.odd_gravity(98.0),
         assess.PERPENDICULAR,
         assess.WALLED,
@@ -144,12 +145,19 @@ def _all():
         *calibrate(_means(_rows(0.02)), Settings(g=G, weights="auto")).warnings,
         *calibrate(_means(_rows(0.1)), Settings(g=G, weights="auto")).warnings,
         *calibrate(_means(two), Settings(g=G, weights="auto")).warnings,
+        *calibrate(_warming(), Settings(g=G)).warnings,
         *_calibrated(DPSO.output(G * faces + noise(12, 1e-3, 1))),
         *_calibrated(wrong),
         *_calibrated(DPSO.output(1.01 * u + noise(24, 1e-3, 1)), nominal=Nominal(scale=(5.67e5,) * 3)),
         *_calibrated(DPSO.output(np.tile(u, (500, 1)) + noise(12_000, 0.3, 1))),
         *_calibrated(DPSO.output(np.repeat(u, 100, axis=0) + 0.05 * _creeping(2400))),
     ]
+
+
+def _warming():
+    """Return readings whose temperature goes with their attitudes."""
+    u = poses.directions(14, "fibonacci", np.empty((0, 3)))
+    return Readings.from_array(DPSO.output(G * u + noise(14, 1e-4, 2)), temperature=np.linspace(15, 45, 14))
 
 
 def _of_another_unit():

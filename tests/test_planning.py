@@ -14,9 +14,8 @@ from simulated import DPSO, rotation
 from accelcal_cli.calibration import observability as quality
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.observability import PARAMETERS, Observability, design, next_poses
-from accelcal_cli.calibration.problem import Box, Loetters, pack
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.triangle import compress_each
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimization.minimize import minimize

@@ -116,22 +116,17 @@ class Log:
     formula: Correction
     notes: tuple[str, ...]
 
-    @property
-    def parquet(self) -> bool:
-        """Whether the log is Parquet, and can be written as such."""
-        return not isinstance(self.table, TextTable)
-
     def write(self, file: IO[bytes], *, parquet: bool = False) -> None:
         """Write the changed log, in constant memory.
 
         Args:
             file: where to; with `parquet` a file that has a name.
-            parquet: as Parquet instead of text, which a Parquet log alone can be.
+            parquet: as Parquet instead of text.
 
         Raises:
             DataError: a reading that is wrong, by its line and column.
         """
-        if isinstance(self.table, TextTable):
+        if isinstance(self.table, TextTable) and not parquet:
             rewrite(self.table, self.change, file)
             return
         from accelcal_cli.io.parquet import to_parquet, to_text
@@ -139,18 +134,25 @@ class Log:
         (to_parquet if parquet else to_text)(self.table, self.change, file)
 
 
-def prepare(result: Calibration, table: InputTable, wanted: list[str] | None, options: ColumnOptions) -> Log:
+def prepare(
+    result: Calibration,
+    table: InputTable,
+    wanted: list[str] | None,
+    options: ColumnOptions,
+    count: str | None = None,
+) -> Log:
     """Return a log together with what the result makes of it.
 
     Args:
         result: the calibration; its verdict is the caller's concern.
         table: the log; `wanted` names its three output columns, or None.
         options: what to write.
+        count: the column of counts, or "none"; None to go by the names.
 
     Raises:
         DataError, UsageError: no such columns, or a new one has the name of one that is there.
     """
-    columns = choose(table, wanted)
+    columns = choose(table, wanted, count=count)
     names = list(table.names or ())
     kept = [n for k, n in enumerate(names) if not (options.replace and k in columns.output)]
     taken = [name for name in options.names if name in kept]
@@ -159,7 +161,8 @@ def prepare(result: Calibration, table: InputTable, wanted: list[str] | None, op
     warm = () if result.temperature is None or columns.temperature is None else (columns.temperature,)
     places = columns.output if options.replace else ()
     formula = Correction(result, options)
-    change = Change(Selection((*columns.output, *warm)), formula, options.names, places)
+    selection = Selection((*columns.output, *warm), carried=frozenset(warm))
+    change = Change(selection, formula, options.names, places)
     return Log(table, change, formula, _notes(columns, result, used=bool(warm)))
 
 

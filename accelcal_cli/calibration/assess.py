@@ -23,13 +23,13 @@ from accelcal_cli.calibration.observability import (
     poses_to_add,
     unit,
 )
-from accelcal_cli.calibration.residuals import OUTLIER_LEVEL, pattern_chance
+from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
-from accelcal_cli.calibration.sample import NO_NOISE
+from accelcal_cli.calibration.sample import NO_NOISE, axis_up
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.notices import Notice, Severity, are_serious
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
-from accelcal_cli.sensor.poses import AXES, axis_up
+from accelcal_cli.sensor.poses import AXES
 
 FEWEST_KNOWN = 6
 """Poses that a poor set is brought to where the attitudes are known."""
@@ -77,8 +77,8 @@ MATTERS = 0.3
 LESS_THAN_NOISE, SURELY_LESS = 0.5, 1e-4
 """Residuals of at most this part of the noise that the scatter predicts, and by chance this rarely, are told of."""
 
-SURELY_PATTERN = 5e-4
-"""Chance of a pattern in the residuals below which it is told of."""
+SURELY_PATTERN, LIKELY_PATTERN = 5e-4, 0.01
+"""Chance of a pattern in the residuals below which it is told of, and where they are surely more than noise."""
 
 CHECKABLE, FEW_TO_CHECK = 0.9, 3
 """Leverage up to which a pose is checked by the others, and the degrees of freedom up to which that is asked: beyond
@@ -135,19 +135,24 @@ def assess(fit: Fit) -> Assessment:
             suggestions[at], reasons[at] = _advice(fit, at, unchecked[at])
     outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
-    left, (bent, drift) = _to_gain(fit), _patterns(fit)
-    patterned = (bent < SURELY_PATTERN) | (drift < SURELY_PATTERN)
+    left, (bent, drift) = _to_gain(fit), fit.patterns
+    limit = np.where(_are_more_than_noise(fit), LIKELY_PATTERN, SURELY_PATTERN)
+    patterned = (bent < limit) | (drift < limit)
     for at in np.flatnonzero(_may_have_warnings(fit, left) | patterned).tolist():
-        own = _patterns_in_words(float(bent[at]), float(drift[at]))
+        own = _patterns_in_words(float(bent[at]), float(drift[at]), float(limit[at]))
         warnings[at] = (*_warnings(fit, at, float(left[at]), outliers[at]), *own)
     verdicts = [_verdict(word, said) for word, said in zip(geometry, warnings, strict=True)]
     return Assessment(fit, verdicts, reasons, suggestions, warnings, outliers)
 
 
 def _unchecked(fit: Fit) -> Bool:
-    """Return which of the kept poses no other checks, of few without scatter, shape (R, k)."""
+    """Return which of the kept poses no other checks, of few whose scatter does not bear them out, shape (R, k)."""
     asked = (fit.freedom >= 1) & (fit.freedom <= FEW_TO_CHECK) & np.isnan(fit.spread.ratio)
     asked &= fit.solution is not None
+    noise = None if fit.solution is None else fit.solution.stated.noise
+    if noise is not None:  # a robust loss has no ratio
+        expected = noise.variance.sum(axis=1) / fit.sample.poses
+        asked &= ~(noise.known & (fit.spread.variance <= MORE_THAN_NOISE**2 * expected))
     return np.asarray((fit.residuals.leverage >= CHECKABLE) & fit.residuals.real & asked[:, None])
 
 
@@ -201,7 +206,7 @@ def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[
     if not known and attitudes < poses and view.verdict != "good":
         lines.insert(0, f"The {poses:,} poses have {attitudes} different attitudes, and those decide.")
     if unchecked.any():
-        which = [fit.sample.readings(at).where(pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
+        which = [fit.sample.where(at, pose) for pose in fit.residuals.pose[at, unchecked].tolist()]
         lines.append(
             f"No other pose checks {_listed(which)}: an error there would not show. Take at least {FEWEST_POSES + 1}."
         )
@@ -236,50 +241,52 @@ def _to_gain(fit: Fit) -> Float:
 def _may_have_warnings(fit: Fit, left: Float) -> Bool:
     """Return which sensors `_warnings` has something to say of, or might have, shape (R,)."""
     g, s, settings, spread = fit.settings.g, fit.s, fit.settings, fit.spread
-    noisy = (
-        (s > LARGE * g)
-        | (fit.bias > 0).any(axis=1)
-        | (fit.largest_misalignment > TURNED)
-        | (fit.clusters > 0)
-    )
+    noisy = (s > LARGE * g) | (fit.bias > 0).any(axis=1) | (fit.clusters > 0)
+    noisy |= fit.largest_misalignment > TURNED
     noisy |= (spread.ratio >= MORE_THAN_NOISE) | (spread.ratio <= LESS_THAN_NOISE)
     searched = (left > STOPPED_SHORT) | (fit.search.agreeing < fit.search.runs)
     searched |= fit.at_wall.any(axis=1) | (fit.geometry.attitudes < _fewest_attitudes(fit))
     always = bool(odd_gravity(g)) or not settings.misalignment or fit.solution is None
-    always |= settings.nominal is not None
+    always |= settings.nominal is not None or fit.sample.temperature is not None
     always |= fit.solution is not None and fit.solution.stated.tremor is not None
     return np.asarray(noisy | searched | fit.sample.doubtful | fit.residuals.outlier.any(axis=1) | always)
 
 
-def _patterns(fit: Fit) -> tuple[Float, Float]:
-    """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
-
-    A quadratic and a cubic term of each axis; a bias that changes evenly from the first pose to the last.
-    """
-    residuals, sample = fit.residuals, fit.sample
-    poses = int(sample.poses.max())
-    if fit.solution is None or residuals.pose.shape[1] < poses or fit.solution.slopes is not None:
-        return np.full(len(sample), np.nan), np.full(len(sample), np.nan)
-    weights = fit.solution.robust_weights()
-    w = residuals.real.astype(float) if weights is None else weights
-    u = unit(residuals.force)
-    time = (residuals.pose / np.maximum(sample.poses[:, None] - 1, 1))[..., None]
-    bent = pattern_chance(residuals, w, np.concatenate([u**3, u**4], axis=2), fit.settings.g)
-    return bent, pattern_chance(residuals, w, time * u, fit.settings.g)
+def _are_more_than_noise(fit: Fit) -> Bool:
+    """Return whose residuals are surely more than what the scatter within the poses predicts, shape (R,)."""
+    return np.asarray((fit.spread.ratio >= MORE_THAN_NOISE) & (fit.spread.p_more <= SURELY))
 
 
-def _patterns_in_words(bent: float, drift: float) -> tuple[Notice, ...]:
-    """Return warnings of patterns in the residuals, by their p-values."""
-    notices = []
-    if drift < SURELY_PATTERN:
-        text = f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
-        remedy = "Let the sensor warm up first, or add a column of temperatures."
-        notices.append(Notice("residuals", "warning", text, remedy))
-    if bent < SURELY_PATTERN:
-        text = f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
-        remedy = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
-        notices.append(Notice("residuals", "warning", text, remedy))
-    return tuple(notices)
+def _patterns_in_words(bent: float, drift: float, limit: float) -> tuple[Notice, ...]:
+    """Return warnings of patterns in the residuals, by their p-values and the limit of these."""
+    drifts = (
+        f"The residuals drift from the first pose to the last (p = {drift:.1g}): the bias changed meanwhile."
+    )
+    bends = (
+        f"The residuals bend with the direction (p = {bent:.1g}), as those of a sensor that is not linear."
+    )
+    warm_up = "Let the sensor warm up first, or add a column of temperatures."
+    again = "Measure again to be sure; scale factors and biases then hold for these attitudes alone."
+    found = ((drift, drifts, warm_up), (bent, bends, again))
+    return tuple(
+        Notice("residuals", "warning", text, remedy) for chance, text, remedy in found if chance < limit
+    )
+
+
+def _drift(fit: Fit, at: int) -> tuple[Notice, ...]:
+    """Return a warning of temperatures that are not used although a drift with them may bias the parameters."""
+    degrees, residuals, solution = fit.sample.temperature, fit.residuals, fit.solution
+    if degrees is None or solution is None or solution.slopes is not None or not fit.settings.temperature:
+        return ()
+    warmth, weight = degrees[at, residuals.pose[at]], residuals.weight[at]
+    if not np.isfinite(warmth).all() or residuals.pose.shape[1] < int(fit.sample.poses[at]):
+        return ()
+    from accelcal_cli.calibration.temperature import drift_unseen
+
+    more = bool(_are_more_than_noise(fit)[at])
+    return drift_unseen(
+        unit(residuals.force[at]), weight, warmth, float(fit.s[at]), fit.settings.g, shown=more
+    )
 
 
 def _fewest_attitudes(fit: Fit) -> int:
@@ -308,11 +315,12 @@ def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tupl
         *((WALLED,) if walled else ()),
         *lines,
         *_against_labels(fit, at),
-        *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at])),
+        *more_than_noise(float(spread.ratio[at]), float(spread.p_more[at]), freedom),
         *_less_than_noise(fit, at),
         *_noise_bias(fit, at),
         *_tremor(fit, at),
         *_correlated(fit, at),
+        *_drift(fit, at),
         *_unfinished(int(fit.search.agreeing[at]), fit.search.runs, left),
         *(() if settings.misalignment else (PERPENDICULAR,)),
         *odd_gravity(settings.g),
@@ -489,17 +497,25 @@ def _listed(poses: Sequence[str]) -> str:
     return ", ".join(poses[:MOST_NAMED]) + more
 
 
-def more_than_noise(ratio: float, chance: float) -> tuple[Notice, ...]:
-    """Return a note of residuals of so many times the noise that the scatter predicts, and its p-value.
+def more_than_noise(ratio: float, chance: float, freedom: int) -> tuple[Notice, ...]:
+    """Return what is said of residuals of so many times the noise that the scatter predicts, and its p-value.
 
-    Sigma counts them: what moves the poses at random is in the intervals.
+    Sigma counts them: what moves the poses at random is in the intervals. With few degrees of freedom nothing tells
+    that from an error that goes with the direction, which biases the parameters.
     """
     if not (ratio >= MORE_THAN_NOISE and chance <= SURELY):
         return ()
     text = (
         f"The residuals are {ratio_in_words(ratio)} times what the scatter within the poses explains: the sensor "
-        "moved in them, changed its temperature or is not linear. Sigma counts that as noise."
+        "moved in them, changed its temperature or is not linear."
     )
+    if freedom <= FEW_TO_CHECK:
+        text += (
+            f" Sigma counts that as noise, but {freedom} degrees of freedom do not tell whether it is random."
+        )
+        remedy = "Take 18 poses or more, faces among them, and let the sensor warm up first."
+        return (Notice("residuals", "warning", text, remedy),)
+    text += " Sigma counts that as noise."
     remedy = "Let the sensor warm up, fix it in each pose, or add a column of temperatures."
     return (Notice("residuals", "note", text, remedy),)
 
@@ -557,9 +573,7 @@ def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
         return ()
     readings, residuals = fit.sample.readings(at), fit.residuals
     real = residuals.real[at]
-    votes = np.zeros(
-        (3, 2), dtype=int
-    )  # of each axis: labels that the fit bears out, and that it contradicts
+    votes = np.zeros((3, 2), dtype=int)  # of each axis: labels that the fit bears out, and others
     for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
         said = axis_up(readings.where(pose))
         if said is not None:

@@ -14,14 +14,12 @@ from accelcal_cli import __version__
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.assess import Assessment, assess
 from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.observability import unit
-from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, PoseFit, Sigma
+from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, Sigma
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
-from accelcal_cli.sensor.model import ErrorModel
 
 CURVE_POINTS = 120
 """Points kept of the convergence curve."""
@@ -98,12 +96,12 @@ def assessed(sample: Sample, settings: Settings, *, closed: bool = False) -> Ass
 
 def record(assessment: Assessment, at: int) -> Calibration:
     """Return the record of the sensor number `at` of an assessment."""
-    fit, model = assessment.fit, ErrorModel(assessment.fit.K[at], assessment.fit.D[at])
+    fit = assessment.fit
     return Calibration(
-        K_a=model.K,
-        D_a=model.D,
-        K_A=model.K_A,
-        f_0=model.f_0,
+        K_a=fit.K[at],
+        D_a=fit.D[at],
+        K_A=fit.K_A[at],
+        f_0=fit.K_A[at] @ fit.D[at],
         gauge=fit.gauge,
         sigma=Sigma(fit.sigma_K[at], fit.sigma_D[at]),
         interval=NO_INTERVAL,
@@ -131,7 +129,7 @@ def record(assessment: Assessment, at: int) -> Calibration:
         evaluations=int(fit.search.evaluations[at]),
         runs=fit.search.runs,
         runs_agreeing=int(fit.search.agreeing[at]),
-        poses_fit=_pose_fits(assessment, at),
+        poses_fit=fit.pose_fits(at),
         outliers=assessment.outliers[at],
         convergence=_curve(fit.search, at),
         optimizer=fit.search.optimizer,
@@ -159,28 +157,6 @@ def _nine_of(geometry: Float, view: Float) -> Float:
     return geometry if len(geometry) == len(view) else view
 
 
-def _pose_fits(assessment: Assessment, at: int) -> tuple[PoseFit, ...]:
-    fit, readings = assessment.fit, assessment.fit.sample.readings(at)
-    residuals, (K, D) = fit.residuals, fit.sight
-    real = residuals.real[at]
-    output = ErrorModel(fit.lower[at], fit.D[at]).output(residuals.force[at, real])
-    force = ErrorModel(K[at], D[at]).specific_force(output)
-    directions = unit(force).tolist()
-    return tuple(
-        PoseFit(
-            pose=int(pose),
-            where=readings.where(int(pose)),
-            residual=float(residuals.error[at, k]),
-            studentised=float(residuals.studentised[at, k]),
-            leverage=float(residuals.leverage[at, k]),
-            left_out=float(residuals.left_out[at, k]),
-            residual_before=float(residuals.before[at, k]),
-            direction=tuple(direction),
-        )
-        for k, (pose, direction) in enumerate(zip(residuals.pose[at, real], directions, strict=True))
-    )
-
-
 def _curve(search: Search, at: int) -> tuple[tuple[int, float], ...]:
     """Return the best run's best cost so far against its evaluations, thinned."""
     run, best = search.run, search.best
@@ -199,7 +175,7 @@ def _settings_record(assessment: Assessment, at: int) -> dict[str, object]:
     stated = asdict(settings)
     if solution is not None:
         problem, box = solution.stated, solution.stated.cost.box
-        stated["parameters"] = asdict(settings.build_optimizer())
+        stated["parameters"] = assessment.fit.search.parameters
         stated["box"] = {
             **asdict(settings.box),
             "centre": box.centre[at].tolist(),

@@ -12,40 +12,40 @@ from functools import cached_property
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.attitudes import CellCount, Geometry, distinct
-from accelcal_cli.calibration.covariance import (
+from accelcal_cli.calibration.noise import (
     Clusters,
     NoiseSpread,
     autocorrelated,
+    directions,
     isotropic_bias,
     jumps,
     noise_bias,
     plain_spread,
     scattered_spread,
 )
-from accelcal_cli.calibration.distributions import f_chance, student_quantile
 from accelcal_cli.calibration.observability import (
     ALIGNED,
+    STANDARD,
+    CellCount,
+    Geometry,
     Observability,
     PoseVerdict,
     design,
+    distinct,
     moved_sensor,
     propagate,
     unit,
 )
-from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, length_error, pose_residuals, worst
-from accelcal_cli.calibration.result import Temperature
-from accelcal_cli.calibration.sample import NO_NOISE, Sample, loss_slope, loss_weight
-from accelcal_cli.calibration.search import SLOPES, Search, Solution
+from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, bend_and_drift, pose_residuals, worst
+from accelcal_cli.calibration.result import PoseFit, Temperature
+from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error, loss_slope, loss_weight
+from accelcal_cli.calibration.search import SLOPES, Search, Solution, state, unsearched
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import directions
-from accelcal_cli.sensor.model import Gauge, misalignment, to_gauge
+from accelcal_cli.io.readings import Readings
+from accelcal_cli.sensor.model import ErrorModel, Gauge, misalignment, to_gauge
 
 EDGE = 1e-6
 """A parameter within this part of a half-width from the wall of its box is at the edge."""
-
-COVERAGE = 0.95
-"""Part of the intervals that hold the true value."""
 
 NOTABLE_BIAS = 0.05
 """Sigmas of a parameter from which on the noise bias is taken off."""
@@ -116,8 +116,8 @@ class Fit:
 
     @cached_property
     def coverage(self) -> Float:
-        """Factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,); see `coverage_of`."""
-        return coverage_of(self.spread.freedom)
+        """Factor k by which a sigma becomes the half-width of its 95 % interval, shape (R,)."""
+        return self.spread.coverage()
 
     @cached_property
     def sigma(self) -> Float:
@@ -129,6 +129,23 @@ class Fit:
         """Largest angle by which two axes miss 90 degrees, rad, shape (R,)."""
         return np.asarray(np.abs(misalignment(self.lower)).max(axis=1))
 
+    @cached_property
+    def K_A(self) -> Float:  # noqa: N802
+        """Inverse matrices, m/s^2 per output unit, shape (R, 3, 3)."""
+        return np.linalg.inv(self.K)
+
+    @cached_property
+    def patterns(self) -> tuple[Float, Float]:
+        """P-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
+
+        NaN with known attitudes, where slopes are fitted, and where not all residuals are kept.
+        """
+        poses = self.sample.poses
+        every = self.residuals.pose.shape[1] >= int(poses.max())
+        if self.solution is None or self.solution.slopes is not None or not every:
+            return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
+        return bend_and_drift(self.residuals, poses, self.settings.g)
+
     @property
     def temperature(self) -> Temperature | None:
         """The slopes with temperature, where there are any, with their intervals; of one sensor."""
@@ -137,14 +154,25 @@ class Fit:
         slopes = self.solution.slopes.with_covariance(self.spread.covariance[0])
         return slopes.with_intervals(float(self.coverage[0]))
 
-
-def coverage_of(freedom: Float) -> Float:
-    """Return the coverage factors of 95 % intervals, Student's t [gum2008], shape (R,); NaN below one of freedom.
-
-    Here a sigma and its degrees of freedom, shape (R,), meet: whole or not, they are those of the sigma that is stated.
-    """
-    factors = {n: student_quantile(0.5 + 0.5 * COVERAGE, n) for n in set(freedom.tolist()) if n >= 1}
-    return np.array([factors.get(n, np.nan) for n in freedom.tolist()])
+    def pose_fits(self, at: int) -> tuple[PoseFit, ...]:
+        """Return the kept residuals of the sensor number `at`, pose by pose, with the directions they are seen in."""
+        sample, residuals, (K, D) = self.sample, self.residuals, self.sight
+        real = residuals.real[at]
+        output = ErrorModel(self.lower[at], self.D[at]).output(residuals.force[at, real])
+        directions = unit(ErrorModel(K[at], D[at]).specific_force(output)).tolist()
+        return tuple(
+            PoseFit(
+                pose=int(pose),
+                where=sample.where(at, int(pose)),
+                residual=float(residuals.error[at, k]),
+                studentised=float(residuals.studentised[at, k]),
+                leverage=float(residuals.leverage[at, k]),
+                left_out=float(residuals.left_out[at, k]),
+                residual_before=float(residuals.before[at, k]),
+                direction=tuple(direction),
+            )
+            for k, (pose, direction) in enumerate(zip(residuals.pose[at, real], directions, strict=True))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +209,7 @@ def fit(solution: Solution) -> Fit:
     spread, clusters = _spread(solution, point, sums)
     at_wall, shown = _at_wall(solution.x), to_gauge(point.K, settings.gauge)
     view, information, sight = _first_sight(solution, point)
-    geometry = _geometry(solution, information, sight, held)
+    geometry = _geometry(solution, view, information, sight, held)
     verdicts, walled = geometry.observability.verdicts, np.asarray(at_wall.any(axis=1))
     covariance = _covariance(observability, verdicts, spread, walled, g)
     sigma_K, sigma_D = propagate(shown, point.lower, covariance, settings.gauge, g)
@@ -216,6 +244,43 @@ def fit(solution: Solution) -> Fit:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class QuickFit:
+    """What the least cost says of one sensor, without search, noise bias and covariance: it compares sets of poses.
+
+    Attributes:
+        model: the sensor, gauge `lower`.
+        rms: of |f| - g, m/s^2; sigma: of the worst parameter, m/s^2, as if the attitudes were twelve; NaN where the
+            poses fix no ellipsoid, sigma also where they leave no freedom.
+        verdict: on the attitudes.
+    """
+
+    model: ErrorModel
+    rms: float
+    sigma: float
+    verdict: PoseVerdict
+
+
+def quick_fit(readings: Readings, settings: Settings) -> QuickFit:
+    """Fit the readings of one sensor at the least cost."""
+    sample = Sample.of([readings])
+    plain = state(sample, replace(settings, weights="none"))
+    if plain.sources[0] == "sphere":
+        # Where the poses determine no more than the nearest sphere, no search has to find that out.
+        centre = np.zeros_like(plain.cost.box.centre)
+        if Observability.of(plain.cost.information(centre), sample.poses)[0].verdict == "undetermined":
+            K, D = plain.cost.parameters(centre)
+            return QuickFit(ErrorModel(K[0], D[0]), np.nan, np.nan, "undetermined")
+    solution = unsearched(plain if settings.weights == "none" else state(sample, settings))
+    point = _point(solution, None)
+    geometry = _geometry(solution, *_first_sight(solution, point), None).observability[0]
+    s = np.sqrt(_variance(solution, np.zeros((7, 1)), point.freedom)[0])
+    parts = [length_error(e[0], settings.g) for _, e, _ in sample.errors(point.lower, point.D, settings.g)]
+    rms = np.sqrt(np.mean(np.concatenate(parts) ** 2))
+    verdict = "undetermined" if _at_wall(solution.x).any() else geometry.verdict
+    return QuickFit(ErrorModel(point.lower[0], point.D[0]), float(rms), float(s * geometry.worst), verdict)
+
+
 def _point(solution: Solution, held: Bool | None) -> _Point:
     """Return the sensors at the least cost."""
     sample = solution.sample
@@ -225,7 +290,7 @@ def _point(solution: Solution, held: Bool | None) -> _Point:
     information = nine.information(x) - (0.0 if slopes is None else slopes.loss)
     observability = Observability.of(information, sample.poses, held)
     unknowns = min(9, solution.cost.unknowns) + SLOPES * (slopes is not None)
-    counted = solution.stated.counted()
+    counted = solution.sample.counted(solution.stated.rejected)
     lower, bias = nine.parameters(x)[0], np.zeros((len(sample), 9))
     return _Point(K, D, lower, information, observability, counted - unknowns, bias)
 
@@ -245,7 +310,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     part = np.full(len(bias), SUPPOSED_BIAS)
     if noise is not None and noise.known.any():
         u = directions(solution.sample, point.lower, point.D)
-        w = solution.stated.each_weight()
+        w = solution.sample.each_weight(solution.stated.weights)
         own = noise_bias(u, w, noise.covariance, cofactor, g)
         # A vibration scatters the readings and averages out: their means are less noisy than the scatter says.
         expected = np.sum(w * noise.variance, axis=1) / solution.sample.poses
@@ -286,28 +351,17 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
     clusters = np.zeros(len(sample), dtype=np.intp)
     if stated.noise is not None and solution.noise is None:
         u = directions(sample, point.lower, point.D)
-        w = stated.each_weight()
+        w = sample.each_weight(stated.weights)
         rows = design(u) if solution.slopes is None else solution.slopes.rows
         spread = scattered_spread(spread, rows, w, cofactor, stated.noise, freedom)
         if stated.own is not None:
-            spread = _by_own(spread, stated.own, stated.noise.freedom(np.ones_like(w)))
+            spread = spread.by_own(stated.own, stated.noise.freedom(np.ones_like(w)))
     for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses)).tolist():
         one = _clusters(solution, point, at)
         covariance, own, clusters[at] = one.spread(cofactor[at, :9, :9])
         spread.covariance[at, :9, 9:], spread.covariance[at, 9:, :9] = 0.0, 0.0
         spread.covariance[at, :9, :9], spread.freedom[at] = covariance, own
     return spread, clusters
-
-
-def _by_own(spread: NoiseSpread, own: tuple[float, int], freedom: Float) -> NoiseSpread:
-    """Return the spread with the noise ratio of a fit that no shared error is fitted to: sum e^2 / v over J - p."""
-    square, first = own[0] / own[1], np.array([float(own[1])])
-    return replace(
-        spread,
-        ratio=np.array([np.sqrt(square)]),
-        p_more=f_chance(np.array([square]), first, freedom),
-        p_less=f_chance(np.array([1.0 / square]), freedom, first),
-    )
 
 
 def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
@@ -327,7 +381,11 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
 
 
 def _geometry(
-    solution: Solution, information: Float, sight: tuple[Float, Float], held: Bool | None
+    solution: Solution,
+    view: Observability,
+    information: Float,
+    sight: tuple[Float, Float],
+    held: Bool | None,
 ) -> Geometry:
     """Return what the distinct attitudes of the poses determine, seen with the sensors `sight`.
 
@@ -355,6 +413,8 @@ def _geometry(
     alike = attitudes == sample.poses
     if solution.stated.settings.weights != "none" or solution.stated.rejected is not None:
         alike = np.zeros_like(alike)
+    if alike.all() and int(attitudes.max()) <= STANDARD:
+        return Geometry(attitudes, view, information)
     return Geometry.of(np.where(alike[:, None, None], information, once), attitudes, held)
 
 
@@ -415,7 +475,7 @@ def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:
     room = np.where(freedom > 0, freedom, np.nan)
     if _robust(solution) is None:
         return np.asarray(solution.value / (4.0 * solution.stated.settings.g**2) / room)  # L = sum (2 g e)^2
-    poses = solution.stated.counted()
+    poses = solution.sample.counted(solution.stated.rejected)
     mean = sums[4] / poses
     unequal = np.maximum(sums[5] / poses / mean**2 - 1.0, 0.0)
     K = 1.0 + (poses - freedom) / poses * unequal

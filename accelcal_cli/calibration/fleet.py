@@ -28,6 +28,7 @@ from accelcal_cli.calibration.sample import NO_NOISE, NORMAL_MAD, Sample
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.fleet import FleetReadings
+from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import model as units
 
 FAILED = "failed"
@@ -66,6 +67,7 @@ class Fleet:
             in m/s^2, shape (R, 9).
         dop: dilution of precision of the nine parameters, shape (R, 9).
         cost: L, (m/s^2)^4; s: standard deviation of a pose; rms, rms_before: of |f| - g; m/s^2, shape (R,).
+        freedom: degrees of freedom of s, shape (R,).
         verdict: good, weak, suspect, undetermined or failed, shape (R,); reason: what the poses leave open, or why it
             failed, in sentences.
         warnings: what speaks against the readings and the fit, as `calibrate` says it, a tuple of Notice each,
@@ -87,6 +89,7 @@ class Fleet:
     s: Float
     rms: Float
     rms_before: Float
+    freedom: Int
     verdict: np.ndarray
     reason: np.ndarray
     warnings: np.ndarray
@@ -103,16 +106,16 @@ class Fleet:
         return np.array([len(said) > 0 for said in self.warnings], dtype=bool)
 
 
-def check_settings(settings: Settings) -> None:
-    """Refuse what is not done for a fleet.
+def check_settings(settings: Settings, *, each: bool = False) -> None:
+    """Refuse what is not done for a fleet, or where `each` sensor is calibrated by itself (`calibrate_each`).
 
     Raises:
-        ConfigError: a robust loss, weights "auto", known attitudes, gauge `full`, or several runs.
+        ConfigError: known attitudes, gauge `full`, several runs; a robust loss or weights "auto" for all at once.
     """
     for key, allowed in {
         "optimizer": ("levenberg-marquardt",),
-        "robust": ("none",),
-        "weights": ("none", "n", "sd"),
+        "robust": ("none", "huber", "soft-l1") if each else ("none",),
+        "weights": ("none", "n", "sd", *(("auto",) if each else ())),
         "attitudes": ("unknown",),
         "misalignment": (True,),
         "gauge": ("lower", "upper", "symmetric"),
@@ -158,14 +161,50 @@ def calibrate_fleet(
             if keep is not None:
                 for at, number in enumerate(numbers.tolist()):
                     keep(number, record(assessment, at))
-    order = np.argsort(np.concatenate([part.number for part in parts]))
-    fleet = Fleet(
-        **{f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(Fleet)}
-    )
+    fleet = _joined(parts)
     if all(reason.startswith("--weights") for reason in fleet.reason):
         label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
         raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
     return fleet
+
+
+def calibrate_each(
+    readings: Sequence[Readings | str],
+    settings: Settings,
+    keep: Callable[[int, Calibration], None] | None = None,
+) -> Fleet:
+    """Calibrate sensors one by one, each as `calibrate` does: with weights by a shared error and temperature slopes.
+
+    Args:
+        readings: static poses of R sensors; in place of those that there are not, why, without the stop at the end.
+        settings, keep: as in `calibrate_fleet`.
+
+    Raises:
+        ConfigError: settings that are not for a fleet.
+    """
+    check_settings(settings, each=True)
+    parts = []
+    for number, one in enumerate(readings):
+        if isinstance(one, str):
+            parts.append(_failed(np.array([number]), np.zeros(1, dtype=np.intp), [one]))
+            continue
+        sample = Sample.of([one])
+        if fault := sample.faults(settings.weights)[0]:
+            parts.append(_failed(np.array([number]), sample.poses, [fault]))
+            continue
+        assessment = assessed(sample, settings)
+        parts.append(_part(assessment, np.array([number])))
+        if keep is not None:
+            keep(number, record(assessment, 0))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Fleet]) -> Fleet:
+    """Return the parts as one fleet, in the order of the sensors."""
+    order = np.argsort(np.concatenate([part.number for part in parts]))
+    return Fleet(
+        **{f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(Fleet)}
+    )
 
 
 def _part(assessment: Assessment, number: Int) -> Fleet:
@@ -196,6 +235,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         s=fit.s,
         rms=fit.rms,
         rms_before=fit.rms_before,
+        freedom=np.broadcast_to(fit.freedom, sample.poses.shape),
         verdict=np.array(assessment.verdicts, dtype=object),
         reason=texts(assessment.reasons),
         warnings=_objects(assessment.warnings),
@@ -233,6 +273,7 @@ def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:
         s=nan(),
         rms=nan(),
         rms_before=nan(),
+        freedom=np.zeros(len(number), dtype=np.intp),
         verdict=np.full(len(words), FAILED, dtype=object),
         reason=np.array([f"{word[0].upper()}{word[1:]}." for word in words], dtype=object),
         warnings=_objects([()] * len(number)),
@@ -305,7 +346,7 @@ def _shared_variance(fleet: Fleet) -> float:
     if len(known) < FEWEST:
         return 0.0
     # The median of chi-square with n degrees of freedom is n (1 - 2 / 9n)^3.
-    middle = (1.0 - 2.0 / (9.0 * (fleet.poses[known] - 9))) ** 3
+    middle = (1.0 - 2.0 / (9.0 * fleet.freedom[known])) ** 3
     return float(np.median(fleet.s[known] ** 2 / middle))
 
 
@@ -314,7 +355,7 @@ def _noisy(fleet: Fleet, shared: float, g: float, tests: int) -> list[Standout]:
     if shared <= (NO_NOISE * g) ** 2:
         return []
     known = np.flatnonzero(fleet.determined & (fleet.s > 0))
-    freedom = fleet.poses[known] - 9
+    freedom = fleet.freedom[known]
     x = freedom * fleet.s[known] ** 2 / shared
     far = np.flatnonzero(x > freedom + 3.0 * np.sqrt(2.0 * freedom))
     far = far[chi_square_chance(x[far], freedom[far]) * tests < LEVEL]

@@ -14,16 +14,21 @@ from dataclasses import replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.attitudes import Geometry, distinct
-from accelcal_cli.calibration.covariance import plain_spread
 from accelcal_cli.calibration.fit import Fit, uncalibrated
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, Observability, unit
+from accelcal_cli.calibration.noise import alike_weights, plain_spread
+from accelcal_cli.calibration.observability import (
+    RANK_TOLERANCE,
+    ROWS_COLUMNS,
+    Geometry,
+    Observability,
+    distinct,
+    unit,
+)
 from accelcal_cli.calibration.residuals import KEPT, KEPT_WORST, OUTLIER_LEVEL, PoseResiduals, room_of
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import alike_weights
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor.model import to_gauge
@@ -243,6 +248,7 @@ def _residuals(
     return PoseResiduals(
         pose=kept[None],
         real=np.ones((1, len(kept)), dtype=bool),
+        weight=w[None, kept],
         error=modulus[None, kept],
         before=raw[None, kept],
         force=force[None, kept],

@@ -5,32 +5,27 @@
 Everything is done in normalised coordinates x = (N - c) / s and in units of g, where |f| / g = |A (x - d)|
 with A = (K_a g / s)^-1 and d = (D_a - c) / s. There |f|^2 / g^2 = h^T Q h with h = (x, 1) and Q = M^T M,
 M = [A | -A d]: the residual is linear in the 10 entries of Q, so one QR of the readings' rows leaves an 11 x 11
-triangle that holds the cost of 12 readings or of 12 million exactly (calibration.triangle).
+triangle that holds the cost of 12 readings or of 12 million exactly. QR of stacked blocks composes (TSQR), so readings
+of any number pass through in blocks; a weight multiplies its row.
+
+The closed form: readings lie on an ellipsoid, x^T A x + 2 m^T x + d = 0 with trace(A) = 3, nine unknowns by linear
+least squares. A free constant term instead of the trace condition would admit the trivial minimum. The centre is the
+bias, A's Cholesky factor the matrix.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.observability import ROWS_COLUMNS, Observability
+from accelcal_cli.arrays import Float, Int
+from accelcal_cli.calibration.observability import ROWS_COLUMNS
 from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.settings import BoxSettings, Settings
-from accelcal_cli.calibration.triangle import Triangle, compress, fit_ellipsoid, least_squares
 from accelcal_cli.optimization.problem import Problem
-from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.sensor.model import to_gauge
-
-SHIFT = 0.5
-"""The box is moved off the closed form by up to this part of its half-width: the search finds the answer by
-itself, and the answer stays well inside."""
-
-SPHERE_PRIOR = 1e-3
-"""Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what axes
-whose scale factors differ by 3 % pretend to say about an axis that the poses do not turn through."""
 
 PAIRS = (np.array([0, 1, 2, 0, 0, 1, 0, 1, 2, 3]), np.array([0, 1, 2, 1, 2, 2, 3, 3, 3, 3]))
 """Which entries of the symmetric 4 x 4 matrix Q the vector q holds."""
@@ -297,6 +292,68 @@ def _columns(theta: Float) -> Float:
     return M
 
 
+PIECE = 512
+"""Rows of one small QR; LAPACK's panel of 512 x 11 stays in the first-level cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triangle:
+    """The compressed readings of R sensors.
+
+    Attributes:
+        R: upper triangles, shape (R, 11, 11), of the rows [phi(x), 1].
+        centre: c, shape (R, 3), output units.
+        scale: s, shape (R,), output units.
+        poses: J, the number of readings of each sensor, shape (R,).
+    """
+
+    R: Float
+    centre: Float
+    scale: Float
+    poses: Int
+
+    def take(self, index: Int) -> Triangle:
+        """Return the triangles of the sensors at `index`."""
+        return Triangle(self.R[index], self.centre[index], self.scale[index], self.poses[index])
+
+
+def quadric_rows(x: Float) -> Float:
+    """Return [phi(x), 1], shape (..., J, 11), for normalised readings x, shape (..., J, 3).
+
+    Written column by column into memory of shape (..., 11, J): products of contiguous columns.
+    """
+    h = np.ascontiguousarray(x.swapaxes(-1, -2))
+    out = np.empty((*x.shape[:-2], 11, x.shape[-2]))
+    for k in range(3):
+        np.multiply(h[..., k, :], h[..., k, :], out=out[..., k, :])
+        np.multiply(h[..., k, :], 2.0, out=out[..., 6 + k, :])
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        np.multiply(out[..., 6 + i, :], h[..., j, :], out=out[..., 3 + k, :])
+    out[..., 9:, :] = 1.0
+    return out.swapaxes(-1, -2)
+
+
+def compress(
+    blocks: Iterable[tuple[Float, Float | None]], centre: Float, scale: Float, poses: Int
+) -> Triangle:
+    """Compress the readings of R sensors, block by block.
+
+    Args:
+        blocks: pairs of readings, shape (R, B, 3) in output units, and their weights, shape (R, B), or None; a weight
+            of 0 leaves a reading out.
+        centre: c, shape (R, 3); scale: s, shape (R,). Any values serve; near the middle and the radius of the readings
+            they keep the arithmetic free of cancellation.
+        poses: J of each sensor, shape (R,).
+    """
+    R: Float = np.zeros((len(scale), 11, 11))
+    for block, weight in blocks:
+        table = quadric_rows((block - centre[:, None]) / scale[:, None, None])
+        if weight is not None:
+            table *= np.sqrt(weight)[..., None]
+        R = _triangle(np.concatenate([R, _pieces(table)], axis=1))
+    return Triangle(R, centre, scale, poses)
+
+
 def packed(sample: Sample, weights: Float | None, within: Sample | None = None) -> Triangle:
     """Return weighted readings compressed, centred and scaled by their own extent or by that of other readings."""
     extent = within or sample
@@ -309,90 +366,197 @@ def packed(sample: Sample, weights: Float | None, within: Sample | None = None) 
     return compress(blocks, centre, scale, sample.poses)
 
 
-def search_box(triangle: Triangle, settings: Settings) -> tuple[Box, tuple[str, ...]]:
-    """Return the search box of each sensor, and where it comes from: "stated", "closed form" or "sphere".
+def compress_each(readings: Float, weights: Float | None = None) -> Triangle:
+    """Compress the readings of R sensors, shape (R, J, 3), with weights, shape (R, J), or None, all at once."""
+    low, high = readings.min(axis=1), readings.max(axis=1)
+    centre, scale = 0.5 * (low + high), 0.5 * (high - low).max(axis=1)
+    table = quadric_rows((readings - centre[:, None]) / scale[:, None, None])
+    if weights is not None:
+        table *= np.sqrt(weights)[..., None]
+    if table.shape[1] < 11:
+        table = np.concatenate([table, np.zeros((len(table), 11 - table.shape[1], 11))], axis=1)
+    return Triangle(_triangle(table), centre, scale, np.full(len(readings), readings.shape[1]))
 
-    The same in any company.
 
-    Args:
-        triangle: the compressed readings of R sensors.
-        settings: stated nominal, half-widths, gauge, seed.
+def _pieces(table: Float) -> Float:
+    """Return rows with the same R as `table`, shape (R, J, 11), fewer by a factor PIECE / 11 where there are many."""
+    whole = table.shape[1] // PIECE * PIECE
+    if whole <= PIECE:
+        return table
+    small = _triangle(table[:, :whole].reshape(-1, PIECE, 11)).reshape(len(table), -1, 11)
+    return np.concatenate([_pieces(small), table[:, whole:]], axis=1)
+
+
+def _triangle(table: Float) -> Float:
+    """Return R of the QR of (..., rows >= 11, 11), shape (..., 11, 11)."""
+    R: Float = np.linalg.qr(table, mode="r")  # type: ignore[assignment]  # numpy types mode "r" as "reduced"
+    return R
+
+
+LARGEST_CONDITION = 4.0
+"""No accelerometer's axes differ by this factor once each has unit extent, or stand as oblique: beyond it the fit
+describes the noise, not the sensor."""
+
+FILLED = 1.5
+"""Largest factor between the extent of an axis and that of the ellipsoid fitted to it, where axes differ by more than
+LARGEST_CONDITION: readings all over the ellipsoid have as much of it in every axis."""
+
+SURELY_FILLED = 0.1
+"""Largest standard deviation of the squared extents of such an ellipsoid, as a part of them: noise in an axis that does
+not answer fits ellipsoids as flat as it likes, and none so surely."""
+
+MOST_UNLIKE = 2000.0
+"""Largest factor between the extents of two axes: g beside mg is 1000, and beyond that a column is no axis."""
+
+LEAST_SPREAD = 0.25
+"""Least eigenvalue of the correlation of such readings: 1 for a sphere all over, 0 where they lie in a plane."""
+
+SMALLEST_PIVOT = 1e-9
+"""A pivot of the triangle below this part of the largest means a direction the poses say nothing of."""
+
+ROUNDS = 3
+"""Rounds towards the least cost: noise of 1e-3 g leaves a part of 1e-6 in each."""
+
+
+def fit_ellipsoid(triangle: Triangle) -> tuple[Float, Float]:
+    """Return K g / s in gauge `lower`, shape (R, 3, 3), and (D - c) / s, shape (R, 3).
+
+    NaN for a sensor whose readings do not determine an ellipsoid: fewer than nine poses, poses on a common other
+    quadric, or noise that makes the fitted quadric no ellipsoid. Where the axes of the ellipsoid differ too much to be
+    those of a sensor, it is fitted anew with every axis brought to unit extent.
     """
-    unknowns = 6 if not settings.misalignment else 12 if settings.gauge == "full" else 9
-    sensors = len(triangle.scale)
-    if settings.nominal is not None:
-        K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))
-        D = np.broadcast_to(settings.nominal.bias, (sensors, 3))
-        return _box(K, D, settings, unknowns), ("stated",) * sensors
-    K, D = _closed_form(triangle, settings.g)
-    index = np.flatnonzero(np.isfinite(K).all(axis=(1, 2)))
-    index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
-    closed = np.zeros(sensors, dtype=bool)
-    closed[index] = True
-    sphere_K, sphere_D = _sphere(triangle, settings.g)
-    if unknowns == 12:
-        # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
-        K[index] = to_gauge(K[index], "symmetric")
-    K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
-    box = _box(K, D, settings, unknowns)
-    u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
-    moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
-    return Box(np.where(closed[:, None], moved, box.centre), box.half), tuple(
-        "closed form" if c else "sphere" for c in closed
+    K, centre, _ = _ellipsoid(triangle.R[..., :10])
+    refused = np.flatnonzero(np.isnan(K[:, 0, 0]))
+    if len(refused):
+        K[refused], centre[refused] = _of_unit_extent(triangle.take(refused))
+    return K, centre
+
+
+def _of_unit_extent(triangle: Triangle) -> tuple[Float, Float]:
+    """Return what `fit_ellipsoid` does where the axes are of very different scale, NaN elsewhere."""
+    covariance = _moments(triangle)
+    variance = np.einsum("rii->ri", covariance)
+    usable = (variance > 0).all(axis=1) & (triangle.poses > 9)
+    extent = np.sqrt(3.0 * np.where(usable[:, None], variance, 1.0))  # of a sphere all over
+    usable &= extent.max(axis=1) < MOST_UNLIKE * extent.min(axis=1)
+    correlation = 3.0 * covariance / (extent[:, :, None] * extent[:, None, :])
+    usable &= np.linalg.eigvalsh(np.where(usable[:, None, None], correlation, 0.0))[:, 0] > LEAST_SPREAD
+    factor = quadric_rows(1.0 / extent[:, None])[:, 0, :9]
+    factor[:, 3:] *= 0.5  # the rows hold 2 x_i x_j and 2 x_i
+    phi = np.concatenate([triangle.R[..., :9] * factor[:, None], triangle.R[..., 9:10]], axis=2)
+    K, centre, uncertain = _ellipsoid(phi, triangle.poses)
+    size = np.sqrt(np.sum(K**2, axis=2))
+    with np.errstate(invalid="ignore"):
+        usable &= (
+            (size.max(axis=1) < FILLED) & (size.min(axis=1) > 1.0 / FILLED) & (uncertain < SURELY_FILLED)
+        )
+    return (
+        np.where(usable[:, None, None], K * extent[:, :, None], np.nan),
+        np.where(usable[:, None], centre * extent, np.nan),
     )
 
 
-def _box(K: Float, D: Float, settings: Settings, unknowns: int) -> Box:
-    half = half_widths(np.einsum("rii->ri", K), settings.box, settings.g, unknowns)
-    return Box(pack(K, D, unknowns), half)
+def _moments(triangle: Triangle) -> Float:
+    """Return the covariance of the normalised readings, shape (R, 3, 3): products of the columns of the triangle."""
+    sums = np.einsum("rki,rk->ri", triangle.R[..., :9], triangle.R[..., 9])
+    sums /= np.sum(triangle.R[..., 9] ** 2, axis=1)[:, None]
+    sums[:, 3:] *= 0.5
+    mean = sums[:, 6:]
+    return np.asarray(_matrix(sums) - mean[:, :, None] * mean[:, None, :])
 
 
-def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
-    K, d = fit_ellipsoid(triangle)
-    return K * triangle.scale[:, None, None] / g, d * triangle.scale[:, None] + triangle.centre
+def _ellipsoid(phi: Float, poses: Int | None = None) -> tuple[Float, Float, Float]:
+    """Return K in gauge `lower`, centre, and how uncertain the diagonal of A is, as a part of it, shape (R,).
 
-
-def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> Bool:
-    """Whether the poses determine what the closed form says, shape (R,); where they do not, noise has decided it."""
-    problem = Loetters(triangle, settings.g, _box(K, D, settings, 9))
-    seen = Observability.of(problem.information(np.zeros((len(K), 9))), triangle.poses)
-    return np.array([verdict != "undetermined" for verdict in seen.verdicts], dtype=bool)
-
-
-def _sphere(triangle: Triangle, g: float) -> tuple[Float, Float]:
-    """Return K, shape (R, 3, 3), and D, shape (R, 3), of the spheres nearest to readings that fix no ellipsoid.
-
-    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant. A direction that the poses do not turn through
-    is held at the middle of the readings by the prior.
+    Args:
+        phi: the first ten columns of triangles, shape (R, 11, 10).
+        poses: J, shape (R,); without it nothing is uncertain.
     """
-    left, right = triangle.R[..., 6:10], triangle.R[..., :3].sum(axis=2)
-    transposed = left.swapaxes(1, 2)
-    prior = SPHERE_PRIOR * triangle.poses[:, None, None] * np.diag([1.0, 1.0, 1.0, 0.0])
-    c = np.linalg.solve(transposed @ left + prior, transposed @ right[..., None])[..., 0]
-    radius = np.sqrt(np.maximum(c[:, 3] + np.sum(c[:, :3] ** 2, axis=1), 0.0))
-    # Far from the readings' own extent, which is 1, it is noise.
-    radius = np.where((radius > 0.3) & (radius < 3.0), radius, 1.0)
-    K = (radius * triangle.scale / g)[:, None, None] * np.eye(3)
-    return K, c[:, :3] * triangle.scale[:, None] + triangle.centre
+    # trace(A) = 3 eliminates A_33 = 3 - A_11 - A_22.
+    left = np.concatenate([phi[..., :2] - phi[..., 2:3], phi[..., 3:]], axis=-1)
+    right = -3.0 * phi[..., 2]
+    q, r = np.linalg.qr(left)
+    pivots = np.abs(np.einsum("...ii->...i", r))
+    solvable = pivots.min(axis=-1) > SMALLEST_PIVOT * pivots.max(axis=-1)
+    r = np.where(solvable[:, None, None], r, np.eye(9))
+    z = np.linalg.solve(r, q.swapaxes(-1, -2) @ right[..., None])[..., 0]
+    A = np.empty((len(z), 3, 3))
+    A[:, 0, 0], A[:, 1, 1], A[:, 2, 2] = z[:, 0], z[:, 1], 3.0 - z[:, 0] - z[:, 1]
+    A[:, 0, 1] = A[:, 1, 0] = z[:, 2]
+    A[:, 0, 2] = A[:, 2, 0] = z[:, 3]
+    A[:, 1, 2] = A[:, 2, 1] = z[:, 4]
+    m, d = z[:, 5:8], z[:, 8]
+    values = np.linalg.eigvalsh(A)
+    solvable &= (values[:, 0] > 0) & (values[:, 2] < LARGEST_CONDITION**2 * values[:, 0])
+    A = np.where(solvable[:, None, None], A, np.eye(3))
+    centre = -np.linalg.solve(A, m[..., None])[..., 0]
+    level = -np.einsum("ri,ri->r", m, centre) - d  # c^T A c - d
+    solvable &= level > 0
+    shape = np.linalg.inv(A) * np.where(solvable, level, 1.0)[:, None, None]
+    K = np.linalg.cholesky(0.5 * (shape + shape.swapaxes(-1, -2)))
+    uncertain = np.zeros(len(z))
+    if poses is not None:
+        square = np.sum((right - _times(left, z)) ** 2, axis=1) / np.maximum(poses - 9, 1)
+        inverse = np.linalg.inv(r)[:, :2]
+        inverse = np.concatenate([inverse, inverse.sum(axis=1, keepdims=True)], axis=1)
+        own = np.sqrt(square[:, None] * np.sum(inverse**2, axis=2))
+        uncertain = np.max(own / np.einsum("rii->ri", A), axis=1)
+    return (
+        np.where(solvable[:, None, None], K, np.nan),
+        np.where(solvable[:, None], centre, np.nan),
+        uncertain,
+    )
 
 
-ALIKE = 2.0
-"""Largest factor between scale factors that count as alike."""
+def least_squares(triangle: Triangle) -> tuple[Float, Float]:
+    """Return K g / s in gauge `lower`, shape (R, 3, 3), and (D - c) / s, shape (R, 3), at the least cost.
+
+    The rows' last two columns are both ones. With y the quadric x^T A x + 2 m^T x = 1 (A as it comes, not scaled to
+    the trace) the cost is L = F / (1 + e)^2, F = |T y - t|^2 + rho^2 and e = m^T A^-1 m, where T, t and rho are
+    the triangle's first nine columns, the tenth above its diagonal, and its diagonal there. Where its gradient
+    vanishes,
+
+        y = T^-1 t - F / (1 + e) (T^T T)^-1 phi(d),   d = -A^-1 m,
+
+    phi(d) the row of a reading at the centre d. F is the noise squared, so each round gains as many digits. NaN for
+    a sensor whose readings determine no ellipsoid; after much noise the rounds end before the last digits.
+    """
+    T, t, rho = triangle.R[:, :9, :9], triangle.R[:, :9, 9], triangle.R[:, 9, 9]
+    pivots = np.abs(np.einsum("rii->ri", T))
+    solvable = pivots.min(axis=1) > SMALLEST_PIVOT * pivots.max(axis=1)
+    inverse = np.linalg.inv(np.where(solvable[:, None, None], T, np.eye(9)))
+    first = _times(inverse, t)
+    y = first
+    with np.errstate(all="ignore"):
+        for _ in range(ROUNDS):
+            d, e = _centre(y)
+            F = rho**2 + np.sum(_times(T, y - first) ** 2, axis=1)
+            back = _times(inverse.swapaxes(1, 2), quadric_rows(d[:, None])[:, 0, :9])
+            y = first - (F / (1.0 + e))[:, None] * _times(inverse, back)
+        d, e = _centre(y)
+        A = _matrix(y) / (1.0 + e)[:, None, None]
+        values = np.linalg.eigvalsh(np.where(np.isfinite(A), A, 0.0))
+        solvable &= (
+            np.isfinite(A).all(axis=(1, 2)) & np.isfinite(d).all(axis=1) & (values[:, 0] > SMALLEST_PIVOT)
+        )
+    shape = np.linalg.inv(np.where(solvable[:, None, None], A, np.eye(3)))
+    K = np.linalg.cholesky(0.5 * (shape + shape.swapaxes(1, 2)))
+    return np.where(solvable[:, None, None], K, np.nan), np.where(solvable[:, None], d, np.nan)
 
 
-def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Float:
-    """Return the half-widths in the units of the unknowns, shape (..., unknowns), for scale factors (..., 3)."""
-    mean = scale.mean(axis=-1, keepdims=True)
-    turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
-    # An angle is a part of the scale factor of its own axis; of the mean where they are alike.
-    own = box.misalignment * scale[..., [i for i, _ in ROWS_COLUMNS[3 : unknowns - 3]]]
-    alike = scale.max(axis=-1, keepdims=True) <= ALIKE * scale.min(axis=-1, keepdims=True)
-    turned = np.where(alike, turned, own)
-    return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
+def _times(matrix: Float, vector: Float) -> Float:
+    product: Float = (matrix @ vector[..., None])[..., 0]
+    return product
 
 
-def opened(sample: Sample, settings: Settings, weights: Float | None) -> tuple[Loetters, tuple[str, ...]]:
-    """Return the cost of weighted readings in its box, and where the box of each sensor comes from."""
-    triangle = packed(sample, weights)
-    box, sources = search_box(triangle, settings)
-    return Loetters(triangle, settings.g, box), sources
+def _matrix(y: Float) -> Float:
+    """Return A, shape (R, 3, 3), of the quadrics y, shape (R, 9)."""
+    return y[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+
+
+def _centre(y: Float) -> tuple[Float, Float]:
+    """Return d = -A^-1 m, shape (R, 3), and m^T A^-1 m, shape (R,), by cofactors: a singular A gives inf or NaN."""
+    A, m = _matrix(y), y[:, 6:]
+    cofactors = np.stack([np.cross(A[:, k - 2], A[:, k - 1]) for k in range(3)], axis=2)
+    d: Float = -_times(cofactors, m) / np.sum(A[:, 0] * cofactors[..., 0], axis=1)[:, None]
+    return d, -np.sum(m * d, axis=1)

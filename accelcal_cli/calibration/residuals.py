@@ -9,7 +9,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_chance
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
-from accelcal_cli.calibration.sample import NO_NOISE, Sample
+from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error
 
 KEPT = 1000
 """Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""
@@ -45,6 +45,7 @@ class PoseResiduals:
 
     Attributes:
         pose: their numbers, from 0, shape (R, k); real: which are no repetitions, shape (R, k).
+        weight: in the fit, that of a robust loss included, shape (R, k).
         error, before: |f| - g after and before calibration, m/s^2, shape (R, k).
         force: calibrated specific force, gauge `lower`, m/s^2, shape (R, k, 3).
         leverage: part of the pose's own residual that the fit absorbs, shape (R, k).
@@ -55,6 +56,7 @@ class PoseResiduals:
 
     pose: Int
     real: Bool
+    weight: Float
     error: Float
     before: Float
     force: Float
@@ -73,11 +75,6 @@ def worst(columns: list[Float], sample: Sample) -> list[Float]:
     index = np.sort(np.argpartition(-size, last, axis=1)[:, :KEPT_WORST], axis=1)
     rows = np.arange(len(size))[:, None]
     return [column[rows, index] for column in columns]
-
-
-def length_error(e: Float, g: float) -> Float:
-    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
-    return np.asarray(np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g)
 
 
 def pose_residuals(
@@ -118,7 +115,7 @@ def pose_residuals(
         )
         outlier |= np.take_along_axis(rejected, number, axis=1)
     return PoseResiduals(
-        number, real, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
+        number, real, w, error, length_error(e_raw, g), f, leverage, studentised, left_out, outlier
     )
 
 
@@ -199,30 +196,60 @@ FEWEST_SPARE = 3
 """Degrees of freedom that a test for a pattern leaves to the noise at least."""
 
 
-def pattern_chance(residuals: PoseResiduals, w: Float, columns: Float, g: float) -> Float:
-    """Return the p-values of a pattern in the residuals, shape (R,), NaN where the poses cannot tell.
+def bend_and_drift(residuals: PoseResiduals, poses: Int, g: float) -> tuple[Float, Float]:
+    """Return the p-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
 
-    The F test of a fit with q columns more: those of an error that the linear, constant model does not have.
+    A quadratic or a cubic term of each axis, or both; a bias that changes evenly from the first pose to the last.
 
     Args:
-        residuals: of all poses; w: their weights, shape (R, J); columns: of the pattern, shape (R, J, q); g: m/s^2.
+        residuals: of all poses; poses: J of each sensor, shape (R,); g: m/s^2.
     """
-    f = residuals.force
-    rows = np.concatenate([design(unit(f)), columns], axis=2)
-    e = (g * g - np.sum(f * f, axis=2)) / (2.0 * g)
-    normal = (rows * w[..., None]).swapaxes(1, 2) @ rows
-    values, vectors = np.linalg.eigh(normal)
-    known = values > OPEN_DIRECTION * values[:, -1:]
-    part = (vectors.swapaxes(1, 2) @ ((rows * (w * e)[..., None]).sum(axis=1))[..., None])[..., 0]
-    gain = np.sum(np.where(known, part**2 / np.where(known, values, 1.0), 0.0), axis=1)
+    spare = np.count_nonzero(residuals.weight, axis=1) - 9 - 3
+    if spare.max() < FEWEST_SPARE:
+        return np.full(len(spare), np.nan), np.full(len(spare), np.nan)
+    e, rows, cofactor = _linearised(residuals.force, residuals.weight, g, np.arange(9))
+    u = unit(residuals.force)
+    time = (residuals.pose / np.maximum(poses[:, None] - 1, 1))[..., None]
+    kinds = (u**3, u**4, np.concatenate([u**3, u**4], axis=2), time * u)
+    *bends, drift = (pattern_chance(e, rows, residuals.weight, cofactor, columns, g) for columns in kinds)
+    return np.minimum(len(bends) * np.fmin.reduce(bends), 1.0), drift  # Bonferroni
+
+
+def pattern_chance(e: Float, rows: Float, w: Float, cofactor: Float, columns: Float, g: float) -> Float:
+    """Return the p-values of a pattern in the residuals, shape (R,), NaN where the poses cannot tell.
+
+    The F test of a fit with q columns more, B: those of an error that the linear, constant model does not have. Its
+    normal matrix is that of B less what the nine take of it, B^T W B - B^T W A C A^T W B.
+
+    Args:
+        e: residuals, m/s^2, w: weights, shape (R, J); rows: A, shape (R, J, 9); cofactor: C, shape (R, 9, 9), NaN
+            where the poses do not determine the sensor.
+        columns: B, shape (R, J, q); g: m/s^2.
+    """
+    q = columns.shape[2]
+    chance, spare = np.full(len(e), np.nan), np.count_nonzero(w, axis=1) - 9 - q
     total = np.sum(w * e * e, axis=1)
-    spare = np.count_nonzero(w, axis=1) - rows.shape[2]
-    told = known.all(axis=1) & (spare >= FEWEST_SPARE) & (total > (NO_NOISE * g) ** 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = (gain / columns.shape[2]) / (np.maximum(total - gain, 0.0) / spare)
-    x = np.where(told, np.clip(ratio, 1e-12, 1e12), 1.0)
-    freedom = np.where(told, spare, 1).astype(float)
-    return np.where(told, f_chance(x, np.full(len(x), float(columns.shape[2])), freedom), np.nan)
+    at = np.flatnonzero(
+        (spare >= FEWEST_SPARE) & (total > (NO_NOISE * g) ** 2) & ~np.isnan(cofactor[:, 0, 0])
+    )
+    if not len(at):
+        return chance
+    A, B, C, e, w = rows[at], columns[at] * np.sqrt(w[at])[..., None], cofactor[at], e[at], w[at]
+    A, e = A * np.sqrt(w)[..., None], e * np.sqrt(w)
+    taken = C @ (A.swapaxes(1, 2) @ np.concatenate([B, e[..., None]], axis=2))
+    left = np.concatenate([B, e[..., None]], axis=2) - A @ taken  # of B and e, what the nine do not explain
+    whole = np.sum(B * B, axis=(1, 2))
+    normal = left[..., :q].swapaxes(1, 2) @ left[..., :q]
+    inverse = np.linalg.inv(normal + RIDGE * whole[:, None, None] * np.eye(q))
+    open_to = np.einsum("rqq->r", inverse) * whole
+    known = (open_to > 0) & (open_to < 1.0 / OPEN_DIRECTION)
+    part = left[..., :q].swapaxes(1, 2) @ left[..., q:]
+    gain = np.sum(part * (inverse @ part), axis=(1, 2))
+    noise = np.maximum(np.sum(left[..., q] ** 2, axis=1) - gain, 1e-300) / spare[at]
+    ratio = np.clip(gain / q / noise, 1e-12, 1e12)
+    told = at[known]
+    chance[told] = f_chance(ratio[known], np.full(len(told), float(q)), spare[told].astype(float))
+    return chance
 
 
 def leave_out(

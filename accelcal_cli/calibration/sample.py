@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.io.screening import LOOKED_AT
-from accelcal_cli.sensor.poses import axis_up
+from accelcal_cli.sensor.poses import AXES
 
 if TYPE_CHECKING:
     from accelcal_cli.io.fleet import Batch, FleetReadings
@@ -41,6 +42,22 @@ NORMAL_MAD = 1.4826
 
 SCALE_SAMPLE = 100_000
 """At most about this many residuals decide the scale of a robust loss."""
+
+
+UP_OR_DOWN = re.compile(
+    r"(?<![a-z0-9])(?P<sign>[+-]?)(?P<axis>[xyz])[\s_-]*(?:axis[\s_-]*)?(?P<way>up|down)(?![a-z])",
+    re.IGNORECASE,
+)
+"""What in a label says which way a sensor axis points: "+x up", "-z up", "x_down", "Y axis up"."""
+
+
+def axis_up(label: str) -> tuple[int, int] | None:
+    """Return the axis, 0 to 2, that a label says something of, and 1 if its positive end is up, else -1; or None."""
+    found = UP_OR_DOWN.search(label)
+    if found is None:
+        return None
+    up = 1 if found["way"].lower() == "up" else -1
+    return AXES.index(found["axis"].lower()), -up if found["sign"] == "-" else up
 
 
 def _name_up(where: Callable[[int], str], poses: Iterable[int]) -> bool:
@@ -141,9 +158,21 @@ class Sample:
         """R, the number of sensors."""
         return len(self.poses)
 
+    def where(self, at: int, pose: int) -> str:
+        """Return how to name a pose of the sensor number `at`: by its label or its line."""
+        return self.readings(at).where(pose)
+
     def real(self, first: int, width: int) -> Bool:
         """Return which of the poses from `first` on are no repetitions, shape (R, width)."""
         return np.asarray(np.arange(first, first + width) < self.poses[:, None])
+
+    def each_weight(self, weights: Float | None) -> Float:
+        """Return the weight of each pose, 1 where all count alike and 0 for repetitions, shape (R, J)."""
+        return self.real(0, int(self.poses.max())).astype(float) if weights is None else weights
+
+    def counted(self, rejected: Bool | None) -> Int:
+        """Return how many poses are not left out, shape (R,), of those marked in shape (R, J)."""
+        return self.poses if rejected is None else np.asarray(self.poses - rejected.sum(axis=1))
 
     def output(self) -> Float:
         """Return the outputs of all poses, shape (R, J, 3), output units."""
@@ -255,6 +284,11 @@ class Sample:
         for (first, block), (_, e, _) in zip(self.blocks(), self.errors(K, D, settings.g), strict=True):
             own: Float | float = 1.0 if weights is None else weights[:, first : first + e.shape[1]]
             yield block, own * loss_weight(np.sqrt(own) * e / noise[:, None], settings.robust)
+
+
+def length_error(e: Float, g: float) -> Float:
+    """Return |f| - g in m/s^2 from e = (g^2 - |f|^2) / 2g, same shape."""
+    return np.asarray(np.sqrt(np.maximum(g * g - 2.0 * g * e, 0.0)) - g)
 
 
 def loss_weight(z: Float, loss: Robust) -> Float:

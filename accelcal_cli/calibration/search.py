@@ -9,25 +9,33 @@ J - 9 [paule1982].
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.calibration.problem import Loetters, opened
+from accelcal_cli.calibration.noise import MOST_TREMOR, PoseNoise, Tremor, directions, pose_noise, tremor
+from accelcal_cli.calibration.observability import ROWS_COLUMNS, Observability
+from accelcal_cli.calibration.problem import Box, Loetters, Triangle, compress, fit_ellipsoid, pack, packed
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import NO_NOISE, Sample
-from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.triangle import compress
-from accelcal_cli.calibration.weights import (
-    MOST_TREMOR,
-    PoseNoise,
-    Tremor,
-    directions,
-    pose_noise,
-    tremor,
-)
+from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.optimization.minimize import Run, minimize, polish
+from accelcal_cli.optimization.optimizer import Optimizer, State
+from accelcal_cli.rng import Purpose, Streams
+from accelcal_cli.sensor.model import to_gauge
+
+SHIFT = 0.5
+"""The box is moved off the closed form by up to this part of its half-width: the search finds the answer by
+itself, and the answer stays well inside."""
+
+SPHERE_PRIOR = 1e-3
+"""Information a pose lends to the middle of the readings as centre of the sphere, relative to its own: what axes
+whose scale factors differ by 3 % pretend to say about an axis that the poses do not turn through."""
+
+ALIKE = 2.0
+"""Largest factor between scale factors that count as alike."""
 
 SAME_MINIMUM = 1e-6
 """Two searches ended in the same minimum when their polished costs differ by at most this part."""
@@ -79,17 +87,6 @@ class Stated:
         cost, sources = opened(self.sample, self.settings, weights)
         return replace(self, weights=weights, cost=cost, sources=sources)
 
-    def each_weight(self) -> Float:
-        """Return the weight of each pose, 1 where all count alike and 0 for repetitions, shape (R, J)."""
-        if self.weights is not None:
-            return self.weights
-        return self.sample.real(0, int(self.sample.poses.max())).astype(float)
-
-    def counted(self) -> Int:
-        """Return how many poses are not left out, shape (R,)."""
-        rejected = 0 if self.rejected is None else self.rejected.sum(axis=1)
-        return np.asarray(self.sample.poses - rejected)
-
 
 @dataclass(frozen=True, eq=False)
 class Search:
@@ -100,6 +97,7 @@ class Search:
         cost: L of the best run after the search, shape (R,), (m/s^2)^4.
         evaluations: of the cost, search and polish together, shape (R,).
         agreeing: how many runs ended in the best one's minimum, shape (R,).
+        parameters: of the optimizer, by name.
         run: all runs, and `best`, the row of each sensor's best one, shape (R,); None where there was no search.
     """
 
@@ -108,6 +106,7 @@ class Search:
     cost: Float
     evaluations: Int
     agreeing: Int
+    parameters: Mapping[str, object] = field(default_factory=dict)
     run: Run | None = None
     best: Int | None = None
 
@@ -186,6 +185,91 @@ class Solution:
         return replace(self, cost=cost, x=polished.x, value=polished.cost, search=search)
 
 
+def opened(sample: Sample, settings: Settings, weights: Float | None) -> tuple[Loetters, tuple[str, ...]]:
+    """Return the cost of weighted readings in its box, and where the box of each sensor comes from."""
+    triangle = packed(sample, weights)
+    box, sources = search_box(triangle, settings)
+    return Loetters(triangle, settings.g, box), sources
+
+
+def search_box(triangle: Triangle, settings: Settings) -> tuple[Box, tuple[str, ...]]:
+    """Return the search box of each sensor, and where it comes from: "stated", "closed form" or "sphere".
+
+    The same in any company.
+
+    Args:
+        triangle: the compressed readings of R sensors.
+        settings: stated nominal, half-widths, gauge, seed.
+    """
+    unknowns = 6 if not settings.misalignment else 12 if settings.gauge == "full" else 9
+    sensors = len(triangle.scale)
+    if settings.nominal is not None:
+        K = np.broadcast_to(np.diag(settings.nominal.scale), (sensors, 3, 3))
+        D = np.broadcast_to(settings.nominal.bias, (sensors, 3))
+        return _box(K, D, settings, unknowns), ("stated",) * sensors
+    K, D = _closed_form(triangle, settings.g)
+    index = np.flatnonzero(np.isfinite(K).all(axis=(1, 2)))
+    index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
+    closed = np.zeros(sensors, dtype=bool)
+    closed[index] = True
+    sphere_K, sphere_D = _sphere(triangle, settings.g)
+    if unknowns == 12:
+        # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
+        K[index] = to_gauge(K[index], "symmetric")
+    K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
+    box = _box(K, D, settings, unknowns)
+    u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
+    moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
+    return Box(np.where(closed[:, None], moved, box.centre), box.half), tuple(
+        "closed form" if c else "sphere" for c in closed
+    )
+
+
+def _box(K: Float, D: Float, settings: Settings, unknowns: int) -> Box:
+    half = half_widths(np.einsum("rii->ri", K), settings.box, settings.g, unknowns)
+    return Box(pack(K, D, unknowns), half)
+
+
+def _closed_form(triangle: Triangle, g: float) -> tuple[Float, Float]:
+    K, d = fit_ellipsoid(triangle)
+    return K * triangle.scale[:, None, None] / g, d * triangle.scale[:, None] + triangle.centre
+
+
+def _trustworthy(triangle: Triangle, K: Float, D: Float, settings: Settings) -> Bool:
+    """Whether the poses determine what the closed form says, shape (R,); where they do not, noise has decided it."""
+    problem = Loetters(triangle, settings.g, _box(K, D, settings, 9))
+    seen = Observability.of(problem.information(np.zeros((len(K), 9))), triangle.poses)
+    return np.array([verdict != "undetermined" for verdict in seen.verdicts], dtype=bool)
+
+
+def _sphere(triangle: Triangle, g: float) -> tuple[Float, Float]:
+    """Return K, shape (R, 3, 3), and D, shape (R, 3), of the spheres nearest to readings that fix no ellipsoid.
+
+    |x|^2 = 2 c x + (r^2 - |c|^2) is linear in c and the constant. A direction that the poses do not turn through
+    is held at the middle of the readings by the prior.
+    """
+    left, right = triangle.R[..., 6:10], triangle.R[..., :3].sum(axis=2)
+    transposed = left.swapaxes(1, 2)
+    prior = SPHERE_PRIOR * triangle.poses[:, None, None] * np.diag([1.0, 1.0, 1.0, 0.0])
+    c = np.linalg.solve(transposed @ left + prior, transposed @ right[..., None])[..., 0]
+    radius = np.sqrt(np.maximum(c[:, 3] + np.sum(c[:, :3] ** 2, axis=1), 0.0))
+    # Far from the readings' own extent, which is 1, it is noise.
+    radius = np.where((radius > 0.3) & (radius < 3.0), radius, 1.0)
+    K = (radius * triangle.scale / g)[:, None, None] * np.eye(3)
+    return K, c[:, :3] * triangle.scale[:, None] + triangle.centre
+
+
+def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Float:
+    """Return the half-widths in the units of the unknowns, shape (..., unknowns), for scale factors (..., 3)."""
+    mean = scale.mean(axis=-1, keepdims=True)
+    turned = np.repeat(box.misalignment * mean, unknowns - 6, axis=-1)
+    # An angle is a part of the scale factor of its own axis; of the mean where they are alike.
+    own = box.misalignment * scale[..., [i for i, _ in ROWS_COLUMNS[3 : unknowns - 3]]]
+    alike = scale.max(axis=-1, keepdims=True) <= ALIKE * scale.min(axis=-1, keepdims=True)
+    turned = np.where(alike, turned, own)
+    return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
+
+
 def state(sample: Sample, settings: Settings) -> Stated:
     """State the problem of readings that give the weights asked for."""
     counts = sample.counts(settings.weights)
@@ -225,7 +309,7 @@ def _inverse(variance: Float) -> Float:
 def _with_noise(stated: Stated) -> Stated:
     """Return the problem with what the scatter within its poses tells: their noise, and trembling, given back."""
     sample, g = stated.sample, stated.settings.g
-    K, D = first_sensors(stated.cost)
+    K, D = stated.cost.parameters(least_point(stated.cost))
     trembling = tremor(sample, K, D, g)
     if trembling is not None:
         # Directions by a sphere, where the poses fix no ellipsoid, do not tell along from across.
@@ -237,18 +321,26 @@ def _with_noise(stated: Stated) -> Stated:
         sample = sample.with_output(sample.output() + longer @ K.swapaxes(1, 2))
         cost, sources = opened(sample, stated.settings, stated.weights)
         stated = replace(stated, sample=sample, tremor=trembling, cost=cost, sources=sources)
-        K, D = first_sensors(cost)
+        K, D = cost.parameters(least_point(cost))
     return replace(stated, noise=pose_noise(sample, K, D, stated.tremor))
 
 
-def first_sensors(cost: Loetters) -> tuple[Float, Float]:
-    """Return K, shape (R, 3, 3), and D, shape (R, 3), that readings are first seen with: of least cost near the box."""
+def unsearched(stated: Stated) -> Solution:
+    """Return the solution of least cost near the box, found without a search: what readings are first seen with."""
+    x = least_point(stated.cost)
+    value, ones = stated.cost.cost(x[:, None])[:, 0], np.ones(len(x), dtype=np.intp)
+    found = Search("closed form", 1, value, ones, ones)
+    return Solution(stated, found, stated.sample, stated.cost, stated.cost, x, value)
+
+
+def least_point(cost: Loetters) -> Float:
+    """Return the point of least cost, shape (R, D): in closed form, or polished from the centre of the box."""
     x = cost.least_cost()
     poor = ~(np.abs(np.nan_to_num(x, nan=np.inf)) <= 1.0).all(axis=1)
     if poor.any():
         index = np.flatnonzero(poor)
         x[index] = polish(cost.of(index), np.zeros((len(index), cost.unknowns))).x
-    return cost.parameters(x)
+    return x
 
 
 def search(stated: Stated, *, closed: bool = False) -> Solution:
@@ -258,8 +350,8 @@ def search(stated: Stated, *, closed: bool = False) -> Solution:
     wants it: one start per sensor, and the polish confirms it with a step.
     """
     settings, cost, sensors = stated.settings, stated.cost, len(stated.sample)
-    runs = settings.runs
-    run = _closed(stated) if closed else _searched(cost, settings, sensors)
+    runs, optimizer = settings.runs, settings.build_optimizer()
+    run = _closed(stated, optimizer) if closed else _searched(cost, settings, optimizer, sensors)
     x, value = run.x, run.cost
     evaluations = run.evaluations
     if not np.isfinite(value).all():
@@ -277,15 +369,15 @@ def search(stated: Stated, *, closed: bool = False) -> Solution:
     agreeing = (value <= least[:, None] * (1.0 + SAME_MINIMUM) + rounding(cost)[:, None]).sum(axis=1)
     row = np.arange(sensors) * runs + best
     spent = evaluations.reshape(sensors, runs).sum(axis=1)
-    found = Search(settings.optimizer, runs, run.cost[row], spent, agreeing, run, row)
+    found = Search(settings.optimizer, runs, run.cost[row], spent, agreeing, asdict(optimizer), run, row)
     return Solution(stated, found, stated.sample, cost, cost, x[row], least)
 
 
-def _searched(cost: Loetters, settings: Settings, sensors: int) -> Run:
+def _searched(cost: Loetters, settings: Settings, optimizer: Optimizer[State], sensors: int) -> Run:
     """Return the runs of every sensor, those of the first one first; each sensor has runs 0, 1, ... of its own."""
     numbers = list(range(settings.runs)) * sensors
     problem = _tiled(cost, sensors, settings.runs)
-    return minimize(problem, settings.build_optimizer(), runs=numbers, seed=settings.seed)
+    return minimize(problem, optimizer, runs=numbers, seed=settings.seed)
 
 
 def _tiled(cost: Loetters, sensors: int, runs: int) -> Loetters:
@@ -293,7 +385,7 @@ def _tiled(cost: Loetters, sensors: int, runs: int) -> Loetters:
     return cost if sensors == 1 or runs == 1 else cost.of(np.repeat(np.arange(sensors), runs))
 
 
-def _closed(stated: Stated) -> Run:
+def _closed(stated: Stated, optimizer: Optimizer[State]) -> Run:
     """Return one run per sensor at the least cost where the readings give it, else from a search."""
     cost, settings = stated.cost, stated.settings
     x = cost.least_cost()
@@ -303,9 +395,7 @@ def _closed(stated: Stated) -> Run:
     if len(lacking):
         # Each of them would be run 0 of a calibration of its own.
         zeros = [0] * len(lacking)
-        part = minimize(
-            cost.of(lacking), settings.build_optimizer(), runs=zeros, seed=settings.seed, trace=False
-        )
+        part = minimize(cost.of(lacking), optimizer, runs=zeros, seed=settings.seed, trace=False)
         x[lacking], evaluations[lacking] = part.x, part.evaluations
     value = cost.cost(x[:, None])[:, 0]
     return Run(np.zeros(len(x), dtype=np.int64), x, value, evaluations, 0 * evaluations, ())
@@ -343,8 +433,8 @@ def _shared(stated: Stated) -> Stated:
     """
     before = -1.0
     for _ in range(SHARED_ROUNDS):
-        K, D = stated.cost.parameters(polish(stated.cost, np.zeros_like(stated.cost.box.centre)).x)
-        stated, shared = share(stated, stated.sample, (K, D), 9)
+        sensors = stated.cost.parameters(least_point(stated.cost))
+        stated, shared = share(stated, stated.sample, sensors, 9)
         if not shared > 0 or abs(shared - before) <= SHARED_SETTLED * shared:
             break
         before = shared

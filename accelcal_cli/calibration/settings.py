@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, shipped_parameters
+from accelcal_cli.optimization.optimizer import Optimizer, State, built, shipped_parameters
 from accelcal_cli.schema import Checked, check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
@@ -104,7 +104,7 @@ class Settings:
         Raises:
             ConfigError: unknown optimizer or parameter.
         """
-        return from_mapping(OPTIMIZERS.get(self.optimizer), self.parameters, f"optimizer {self.optimizer}")
+        return built(self.optimizer, self.parameters)
 
 
 def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:

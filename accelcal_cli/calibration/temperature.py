@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK, moved_sensor
+from accelcal_cli.calibration.observability import RANK_TOLERANCE, ROWS_COLUMNS, WEAK, design, moved_sensor
 from accelcal_cli.calibration.problem import Loetters, packed
 from accelcal_cli.calibration.result import Temperature
 from accelcal_cli.calibration.sample import Sample
@@ -27,6 +27,7 @@ from accelcal_cli.calibration.search import (
     reweight,
     share,
 )
+from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import ErrorModel, to_gauge
 
 SMALLEST_RANGE = 5.0
@@ -35,6 +36,14 @@ SMALLEST_RANGE = 5.0
 MOST_POSES = 100_000
 ROBUST_ROUNDS, ROBUST_SETTLED = 10, 0.1
 """Rounds at most in which slopes and robust weights follow each other, and the part of a sigma that ends them."""
+
+TYPICAL_DRIFT, SHOWN = 5e-4, 3.0
+"""Drift of a bias in parts of g per degree that data sheets of MEMS accelerometers allow, and the noises of a pose that
+a drift adds to the root sum of squares of the residuals before it shows."""
+
+HIDDEN = 15.0
+"""Sigmas by which a drift that does not show may move a parameter before that is told of: where the temperature does
+not go with the attitudes, by 2 to 5."""
 
 STEPS, SETTLED = 30, 1e-12
 """Gauss-Newton steps at most, and the step, as part of g, that ends them."""
@@ -161,6 +170,48 @@ def _fit(solution: Solution, degrees: Float) -> tuple[Slopes, Sample] | None:
     loss, cofactor = (B @ part)[None], np.linalg.inv(C)[None]
     slopes = Slopes(temperature, loss, found, rows[None], cofactor, part, units)
     return slopes, sample.with_output(brought[None])
+
+
+def drift_unseen(
+    u: Float, w: Float, degrees: Float, s: float, g: float, *, shown: bool
+) -> tuple[Notice, ...]:
+    """Return a warning where a drift with the temperature may bias the parameters, and no slopes are fitted.
+
+    Args:
+        u: unit directions of the poses, shape (J, 3); w: their weights, degrees: temperatures, shape (J,).
+        s: standard deviation of one pose's modulus, m/s^2; g: m/s^2.
+        shown: whether the residuals are more than noise.
+    """
+    span, shift = float(np.ptp(degrees)), hidden_shift(u, w, degrees, s, g)
+    if span < SMALLEST_RANGE or not (shown or shift > HIDDEN):
+        return ()
+    text = f"No slopes are fitted, the temperature changes by {span:.2g} degrees, and the residuals exceed their noise."
+    if not shown:
+        text = (
+            f"The temperature goes with the attitude: a bias that drifts by {TYPICAL_DRIFT * 1e3:g} mg per degree, as "
+            f"data sheets allow, would move a parameter by {shift:.2g} sigma and not show in the residuals."
+        )
+    remedy = "Take the poses in another order, or again at another temperature, 17 or more in all."
+    return (Notice("drift", "warning", text, remedy),)
+
+
+def hidden_shift(u: Float, w: Float, degrees: Float, s: float, g: float) -> float:
+    """Return by how many sigmas a drift that the residuals do not show may move a parameter; see `drift_unseen`.
+
+    Biases b_i t with |b| up to TYPICAL_DRIFT move the nine parameters by M b, the least-squares answer to what they add
+    to the errors, and leave P b in the residuals, shown from SHOWN s on: the largest M b / sigma in that ellipsoid.
+    """
+    half = 0.5 * float(np.ptp(degrees))
+    if not (half > 0 and s > 0):
+        return 0.0
+    root = np.sqrt(w)[:, None]
+    A, C = root * design(u), root * u * ((degrees - degrees.mean()) / half)[:, None]
+    cofactor = np.linalg.pinv(A.T @ A)
+    M = cofactor @ A.T @ C
+    P = C - A @ M
+    inner = P.T @ P / (SHOWN * s) ** 2 + np.eye(3) / (TYPICAL_DRIFT * half * g) ** 2
+    shift = np.einsum("pi,ij,pj->p", M, np.linalg.inv(inner), M)
+    return float(np.sqrt(np.max(shift / np.maximum(s * s * np.diagonal(cofactor), 1e-300))))
 
 
 def slope_rows(output: Float, degrees: Float, slopes: Temperature, sensor: ErrorModel, g: float) -> Float:

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from accelcal_cli.cli import options
-from accelcal_cli.errors import UsageError
 
 PARQUET = (".parquet", ".pq")
 
@@ -54,8 +53,8 @@ def command(
 ) -> None:
     """Apply a calibration to a log of any length.
 
-    Adds the calibrated specific force as columns fx, fy, fz. All other columns stay as they are, byte for byte in
-    text. The log streams through: memory does not grow with it.
+    Adds the calibrated specific force as columns fx, fy, fz. All other columns stay as they are, byte for byte from
+    text to text. The log streams through: memory does not grow with it.
     """
     from accelcal_cli.calibration.apply import ColumnOptions, prepare
     from accelcal_cli.io.columns import restrict
@@ -72,15 +71,14 @@ def command(
     table = open_table(data, sys.stdin.buffer, hashed=False, options=read)
     try:
         restrict(table, read.where)
-        log = prepare(calibration, table, options.split_columns(columns), wanted)
+        log = prepare(calibration, table, options.split_columns(columns), wanted, read.count)
         parquet = Path(output).suffix.lower() in PARQUET
-        if parquet and not log.parquet:
-            raise UsageError(f'-o "{output}": {data} is text and is written as text; expected another ending')
         with whole_file(output, binary=True) as file:
             log.write(file, parquet=parquet)
+        skipped = table.notes if parquet or table.rows_skipped else ()
     finally:
         table.close()
     sys.stdout.flush()
     options.warn(data, log.formula.warnings(), quiet)
-    options.tell(log.notes, quiet)
+    options.tell((*log.notes, *skipped), quiet)
     options.tell_written([output], quiet)

@@ -114,6 +114,6 @@ def command(
         further = [ranking_table(ranking)] if ranking else []
         return benchmark_blocks(title, rows, curves, tolerance, further)
 
-    options.print_result(format, lambda: rows, blocks)
+    options.print_result(format, rows, blocks)
     running.draw_convergence(plot, title, curves, tolerance)
     options.tell_written([study_options.raw, plot], study_options.quiet)

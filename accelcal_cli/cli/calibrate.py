@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -227,4 +228,4 @@ def _show(result: Calibration, format: str, output: str | None) -> None:
             return
     from accelcal_cli.views.calibration import blocks, values
 
-    options.print_result(format, lambda: values(result), lambda: blocks(result), result.record)
+    options.print_result(format, partial(values, result), partial(blocks, result), result.record)

@@ -178,7 +178,7 @@ def command(
     shown = {"Convergence": curves} if curves else {}
     options.print_result(
         format,
-        lambda: rows,
+        rows,
         lambda: study_blocks(title, [replace(rows.filled(), title="")], shown, conditions),
     )
     running.draw_convergence(plot, title, {conditions: curves}, 0.0 if study.noisy else study.tolerance)

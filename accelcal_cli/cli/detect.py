@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -74,7 +75,7 @@ def command(
             write_csv(poses, file)
     if output != "-":
         options.print_result(
-            format, lambda: poses, lambda: views.blocks(detection), lambda: views.record(detection)
+            format, poses, partial(views.blocks, detection), partial(views.record, detection)
         )
     sys.stdout.flush()
     options.warn(data, detection.warnings, quiet)

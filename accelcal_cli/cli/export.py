@@ -64,7 +64,8 @@ def command(
 ) -> None:
     """Write a result in the format of another tool.
 
-    Warns of what the format cannot hold. PX4 and ArduPilot have no misalignments.
+    Warns of what the format cannot hold: PX4 and ArduPilot have no misalignments and no temperature slopes of the
+    scale factors.
     """
     from accelcal_cli.exporters.base import EXPORTERS
     from accelcal_cli.output.files import whole_file

@@ -115,7 +115,7 @@ def command(
     records = study_options.run(study)
     rows = summary(study, records)
     if output != "-":
-        options.print_result(format, lambda: rows, lambda: [rows])
+        options.print_result(format, rows, lambda: [rows])
     _write(study, records, output, plot)
     options.tell_written([study_options.raw, output, plot], study_options.quiet)
 

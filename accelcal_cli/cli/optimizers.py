@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -30,6 +31,6 @@ def command(
     table = views.optimizer_settings(name) if name else views.optimizer_catalogue()
     blocks = views.optimizer_settings_blocks if name else views.optimizer_catalogue_blocks
     options.print_result(
-        format, lambda: views.flat_text(table), lambda: blocks(table), lambda: json_rows([table])
+        format, partial(views.flat_text, table), partial(blocks, table), partial(json_rows, [table])
     )
     options.tell(OPTIMIZERS.faults.values(), quiet)

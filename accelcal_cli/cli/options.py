@@ -535,7 +535,7 @@ def load_result(source: str, data: str | None = None) -> Calibration:
 
 def print_result(
     format: str,
-    table: Callable[[], Table],
+    table: Table | Callable[[], Table],
     blocks: Callable[[], Iterable[Block]],
     record: Callable[[], object] | None = None,
 ) -> None:
@@ -543,7 +543,7 @@ def print_result(
 
     Args:
         format: of FORMATS.
-        table: makes what csv prints.
+        table: what csv prints, or what makes it.
         blocks: makes what people see.
         record: makes what json prints; the rows of the table when None.
     """
@@ -554,10 +554,14 @@ def print_result(
     else:
         from accelcal_cli.output.machine import json_rows, json_text, write_csv
 
-        if format == "json":
-            sys.stdout.write(json_text(record() if record else json_rows([table()])))
+        if format == "json" and record:
+            sys.stdout.write(json_text(record()))
         else:
-            write_csv(table(), sys.stdout)
+            rows = table() if callable(table) else table
+            if format == "json":
+                sys.stdout.write(json_text(json_rows([rows])))
+            else:
+                write_csv(rows, sys.stdout)
     sys.stdout.flush()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -73,7 +74,7 @@ def command(
     verification = verify(old, readings, level, tolerance)
     with process.even_if_unread():
         options.print_result(
-            format, lambda: differences(verification), lambda: blocks(verification), verification.record
+            format, partial(differences, verification), partial(blocks, verification), verification.record
         )
     with process.even_if_unread(sys.stderr):
         options.warn(result, old.warnings, quiet)

@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.io.readings import HEAD
 from accelcal_cli.io.rows import zero_rows
-from accelcal_cli.io.screening import Screened
+from accelcal_cli.io.screening import NOTHING, Screened
 from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import check_unit
 
@@ -122,7 +123,7 @@ class Capture:
     """Watches a stream of readings and captures the poses that are held still.
 
     Attributes:
-        planned: unit directions, shape (P, 3); poses: captured so far.
+        planned: unit directions, shape (P, 3); poses: captured so far; behind: the readings of these.
     """
 
     def __init__(
@@ -147,6 +148,7 @@ class Capture:
         self.planned, self.hold, self.still = planned, max(hold, window), still
         self.stated, self.unit = (scale, centre), unit
         self.poses: list[CapturedPose] = []
+        self.behind = NOTHING
         self.window = np.zeros((window, 3))
         self.count = 0
         self.run: list[Float] = []
@@ -187,6 +189,7 @@ class Capture:
         if readings.std(axis=0).max() > limit:  # it drifts, too slowly for the window to show
             self.run = self.run[-len(self.window) :]
             return "still"
+        self.behind = self.behind.and_also(readings, HEAD)
         away = readings - reading  # so that equal readings have no spread, and their own value as mean
         self._capture(CapturedPose(len(readings), reading + away.mean(axis=0), away.std(axis=0, ddof=1)))
         return "taken"
@@ -228,6 +231,7 @@ class Capture:
             single=False,
             count=np.array([pose.n for pose in self.poses], dtype=float)[real],
             scatter=np.array([pose.spread for pose in self.poses])[real],
+            behind=self.behind,
         )
         return (*screened.notices(), *zeros)
 

@@ -13,11 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.attitudes import APART
-from accelcal_cli.calibration.fit import fit
-from accelcal_cli.calibration.observability import Observability, attitudes, directions_of
-from accelcal_cli.calibration.sample import Sample
-from accelcal_cli.calibration.search import search, state
+from accelcal_cli.calibration.fit import QuickFit, quick_fit
+from accelcal_cli.calibration.observability import APART, attitudes, directions_of
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.detection.intervals import (
     Intervals,
@@ -33,9 +30,9 @@ from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, read_tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import InputForm, Readings
-from accelcal_cli.io.screening import LOOKED_AT, Screened
+from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.notices import Notice
-from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
+from accelcal_cli.sensor.model import STANDARD_GRAVITY
 
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
 """Tried when none is stated; [tedaldi2014] tries 2 to 10 times the variance of a marked still period."""
@@ -103,6 +100,7 @@ class Detection:
         form: of the file.
         envelope: of the log, for a picture; None unless asked for.
         warnings: what the rows show that is no rest.
+        behind: the first rows of acceleration and the extremes of all, sensor units; None where they are not known.
     """
 
     source: str
@@ -120,6 +118,7 @@ class Detection:
     form: InputForm
     envelope: Envelope | None = None
     warnings: tuple[Notice, ...] = ()
+    behind: Behind | None = None
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
@@ -137,6 +136,7 @@ class Detection:
             warm=readings.temperature is not None,
             count=intervals.n[first].astype(float),
             scatter=intervals.scatter[first],
+            behind=self.behind,
         )
         more = [notice for notice in screened.notices() if notice.key not in said]
         return readings.known_as(
@@ -178,7 +178,8 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     rate = settings.rate if settings.rate is not None else log.clock.rate
     lengths = settings.spans.rows(rate)
     envelope = Envelope(lengths.tile) if picture else None
-    in_turn = alternating(*_parted(log))
+    head, times = _parted(log)
+    in_turn = alternating(head, times)
     tiles = read_tiles(log, lengths, envelope)
     level, lively = _screened(tiles, lengths, log)
     segmentations = find_intervals(tiles, lengths, level, settings.multipliers)
@@ -187,12 +188,12 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
     kept = best(enough, candidates) if enough else nearest(segmentations, candidates)
     intervals = segmentations[kept].intervals
     gaps = tiles.gaps.notes(log.clock.unit)
-    zeros, shown = log.zeros, intervals if not enough else _combine(intervals, settings)
+    shown = intervals if not enough else _combine(intervals, settings)
     warnings = (
         *in_turn,
         *lively.clipped(shown, log.columns.names),
         *lively.notices(tiles.size),
-        *zeros.notices(log.where, tiles.rows - zeros.count),
+        *log.zero_rows(tiles.rows),
     )
     detection = Detection(
         source=log.name,
@@ -210,10 +211,12 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         form=replace(log.form, rows=tiles.rows, rate_hz=rate),
         warnings=warnings,
         envelope=envelope,
+        behind=Behind(head, tiles.low, tiles.high),
     )
     if not enough:
         why = explain_too_few(segmentations[kept], candidates[kept], detection)
-        raise TooFewPosesError("; ".join([f"{log.name}: {why}", *gaps]), detection)
+        seen = [notice.text.rstrip(".") for notice in warnings]
+        raise TooFewPosesError("; ".join([f"{log.name}: {why}", *seen, *gaps]), detection)
     return detection
 
 
@@ -242,11 +245,11 @@ def evaluate(segmentation: Segmentation, g: float) -> CandidateThreshold:
     poses = len(intervals)
     if poses < 2 or not np.ptp(intervals.mean, axis=0).any():
         return CandidateThreshold(multiplier, poses, min(poses, 1))
-    model, rms, worst, verdict = screen(readings_of(intervals, "log"), g)
-    distinct = len(attitudes(directions_of(intervals.mean, model), intervals.n, APART))
-    sigma = worst * math.sqrt(poses / distinct)
+    quick = screen(readings_of(intervals, "log"), g)
+    distinct = len(attitudes(directions_of(intervals.mean, quick.model), intervals.n, APART))
+    sigma = quick.sigma * math.sqrt(poses / distinct)
     return CandidateThreshold(
-        multiplier, poses, distinct, rms, sigma if math.isfinite(sigma) else math.inf, verdict
+        multiplier, poses, distinct, quick.rms, sigma if math.isfinite(sigma) else math.inf, quick.verdict
     )
 
 
@@ -273,7 +276,7 @@ def _combine(intervals: Intervals, settings: DetectSettings) -> Intervals:
     angle = settings.merge if settings.merge is not None else settings.thin
     if angle is None:
         return intervals
-    model, *_ = screen(readings_of(intervals, "log"), settings.g)
+    model = screen(readings_of(intervals, "log"), settings.g).model
     groups = attitudes(directions_of(intervals.mean, model), intervals.n, angle)
     if settings.merge is None:
         return intervals.take(np.sort(np.array([group[0] for group in groups])))
@@ -361,23 +364,6 @@ def _stretches(lengths: Int) -> str:
     return f"{_counted(len(lengths), 'stretch')} of {span} rows"
 
 
-def screen(readings: Readings, g: float) -> tuple[ErrorModel, float, float, str]:
-    """Calibrate readings that carry count and scatter, weighted by both and by what the poses share.
-
-    Returns:
-        The sensor they fit; rms of |f| - g, m/s^2, NaN where the poses fix no ellipsoid; sigma of the worst parameter,
-        m/s^2, NaN for nine poses or fewer; the verdict: good, weak or undetermined.
-    """
-    sample, settings = Sample.of([readings]), Settings("levenberg-marquardt", g=g, weights="auto")
-    plain = state(sample, replace(settings, weights="none"))
-    if plain.sources[0] == "sphere":
-        # Where the poses determine no more than the nearest sphere, no search has to find that out.
-        middle = np.zeros_like(plain.cost.box.centre)
-        if Observability.of(plain.cost.information(middle)[0], readings.poses).verdict == "undetermined":
-            K, D = plain.cost.parameters(middle)
-            return ErrorModel(K[0], D[0]), math.nan, math.nan, "undetermined"
-    result = fit(search(state(sample, settings), closed=True))
-    view = result.geometry.observability[0]
-    verdict = "undetermined" if result.at_wall.any() else view.verdict
-    model = ErrorModel(result.lower[0], result.D[0])
-    return model, float(result.rms[0]), float(result.s[0]) * float(view.worst), verdict
+def screen(readings: Readings, g: float) -> QuickFit:
+    """Calibrate readings that carry count and scatter, weighted by both and by what the poses share."""
+    return quick_fit(readings, Settings("levenberg-marquardt", g=g, weights="auto"))

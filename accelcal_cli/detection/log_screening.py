@@ -21,7 +21,7 @@ from accelcal_cli.detection.intervals import ROUNDING, Intervals, StillLevel
 from accelcal_cli.detection.windows import Tiles, Windows
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.rows import SHOWN, named
-from accelcal_cli.io.screening import bits_of_rail
+from accelcal_cli.io.ties import bits_of_rail
 from accelcal_cli.notices import Notice
 
 LONG = 5
@@ -98,12 +98,16 @@ class Liveliness:
         return cls(lively, number, tuple(parts[worst]) if number else (), tiles.low, tiles.high)
 
     def unusable(self, tiles: Tiles) -> Callable[[Float], Bool]:
-        """Return what tells the tiles of a block that are no readings: zeros, and what is frozen."""
+        """Return what tells the tiles of a block that are no readings: zeros, and what is frozen for LONG.
+
+        A few rows may be equal by chance, and must not end a pose.
+        """
 
         def of(block: Float) -> Bool:
             bad = (block[:, :6] == 0).all(axis=1)
             for i in np.flatnonzero(self.axes).tolist():
-                bad |= _is_flat(tiles, block, i)
+                for a, b in _runs(_is_flat(tiles, block, i)):
+                    bad[a:b] = True
             return np.asarray(bad)
 
         return of
@@ -124,7 +128,8 @@ class Liveliness:
 
         In an honest hold some readings are far above the mean, so that the extreme of the log is, too.
         """
-        marks = np.zeros((len(intervals), 3, 2), dtype=bool)
+        poses = len(intervals.n)
+        marks = np.zeros((poses, 3, 2), dtype=bool)
         reach = np.array([_reach(n) for n in intervals.n.tolist()])[:, None]
         rails = [bits_of_rail(float(v)) for v in (*self.low, *self.high)]
         ends = max(np.count_nonzero([bits == n for bits in rails]) for n in rails if n) if any(rails) else 0
@@ -145,7 +150,7 @@ class Liveliness:
         shown = named([intervals.where(k) for k in holds[:SHOWN].tolist()], len(holds))
         text = (
             f"Clipped readings: column {', '.join(columns)}, an end of the range, in {len(holds)} of "
-            f"{len(intervals)} poses ({shown})."
+            f"{poses} poses ({shown})."
         )
         return (
             Notice(

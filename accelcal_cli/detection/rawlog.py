@@ -17,11 +17,12 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.clock import UNITS, Clock, SoundTimes, seconds_of_dates, unit_of, wrong_time
-from accelcal_cli.io.columns import RawColumns, choose_raw, restrict
-from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
+from accelcal_cli.io.columns import RawColumns, choose_raw, own_sensor_column, restrict, sensor_column
+from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, Selection, open_table
 from accelcal_cli.io.readings import InputForm
-from accelcal_cli.io.rows import SKIPPABLE, DeadColumns, OneSensor, RowBlock, ZeroRows
+from accelcal_cli.io.rows import MOST_SENSORS, SKIPPABLE, DeadColumns, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.vocabulary import parse_unit
+from accelcal_cli.notices import Notice
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
@@ -58,6 +59,41 @@ def open_raw_log(
     except BaseException:
         table.close()
         raise
+
+
+def sensors_of(
+    source: str | Path, sensor: str | None = None, *, options: ReadOptions = PLAIN
+) -> tuple[tuple[str, str], ...]:
+    """Return the sensors whose rows a log file holds: the label of each, and the condition that chooses its rows.
+
+    Args:
+        source: path. sensor: the column that labels them; None to find it by its name.
+        options: what the user knows of the form of the table.
+
+    Returns:
+        Pairs of label and COLUMN=VALUE, in the order in which they come; none where no column labels sensors.
+
+    Raises:
+        DataError: unreadable, or a column of more values than there are sensors. UsageError: no such column.
+    """
+    table = open_table(source, hashed=False, options=options)
+    try:
+        restrict(table, options.where)
+        column = own_sensor_column(table) if sensor is None else sensor_column(table, sensor)
+        if column is None:
+            return ()
+        name = str(column + 1) if table.names is None else table.names[column]
+        values: dict[str, None] = {}
+        for rows in table.blocks(Selection((), frozenset({column}), (column,))):
+            values.update(dict.fromkeys(filter(None, rows.texts[0])))
+            if len(values) > MOST_SENSORS:
+                raise DataError(
+                    f'{table.name}: column "{name}" has more than {MOST_SENSORS:,} values; it does not label sensors'
+                )
+    finally:
+        table.close()
+    where = str(column + 1) if "=" in name else name
+    return tuple((value, f"{where}={value}") for value in values)
 
 
 class RawLog:
@@ -186,6 +222,10 @@ class RawLog:
         return np.concatenate([np.empty((0, width)), *(rows.numbers[:, :width] for rows in self._head)])[
             :HEAD
         ]
+
+    def zero_rows(self, rows: int) -> tuple[Notice, ...]:
+        """Return what is said of rows of zeros among so many rows that were read."""
+        return self.zeros.notices(self.where, rows - self.zeros.count)
 
     def close(self) -> None:
         """Release the file."""

@@ -2,7 +2,9 @@
 
 It does so after the driver's own rotation, and turns the board afterwards
 (AP_InertialSensor_Backend::_rotate_and_correct_accel). Its own calibration stores the
-same sign: AccelCalibrator fits diag * (reading + offset) and saves minus its offset.
+same sign: AccelCalibrator fits diag * (reading + offset) and saves minus its offset. Before ACCOFFS it takes a cubic
+polynomial of temperature from the reading, held within TMIN and TMAX: P(T - 35) - P(CALTEMP - 35), coefficients in
+1e-6 m/s^2 (AP_InertialSensor_tempcal.cpp); its scales know no temperature.
 """
 
 from __future__ import annotations
@@ -15,7 +17,11 @@ from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
 from accelcal_cli.schema import setting
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.calibration.result import Calibration, Temperature
+
+PER_COEFFICIENT = 1e6
+"""Coefficients of INS_TCAL for 1 m/s^2 per degree (SCALE_FACTOR of AP_InertialSensor_tempcal.cpp)."""
 
 LARGEST_OFFSET, SCALES = 3.5, (0.8, 1.2)
 """What ArduPilot's parameters may be, m/s^2 and 1: beyond, it refuses to arm."""
@@ -26,7 +32,8 @@ LARGEST_OFFSET, SCALES = 3.5, (0.8, 1.2)
 class ArduPilot(DiagonalExporter):
     """ArduPilot parameters, in the file format of Mission Planner and MAVProxy.
 
-    INS_ACCOFFS_X, ..., INS_ACCSCAL_X, ...: offset D_a in m/s^2, scale of the sensor's own axis.
+    INS_ACCOFFS_X, ..., INS_ACCSCAL_X, ...: offset D_a in m/s^2, scale of the sensor's own axis; INS_TCALn_ACC1_X, ...:
+    slopes of the offset with temperature, where there are any.
     """
 
     orientation = "AHRS_ORIENTATION"
@@ -40,18 +47,50 @@ class ArduPilot(DiagonalExporter):
         from accelcal_cli.sensor.poses import AXES
 
         offset, triad = self.triad(result)
+        slopes, number = self.bias_slopes(result), "" if self.instance == 0 else str(self.instance + 1)
         header = [
-            *base.origin(result),
+            *self.header(result),
             "ArduPilot: corrected = (reading - ACCOFFS) * ACCSCAL, m/s^2, in the axes of the log.",
             *self.notes(result),
         ]
-        number = "" if self.instance == 0 else str(self.instance + 1)
-        lines = "".join(
-            f"INS_ACC{number}{key}_{axis.upper()},{value:.9g}\n"
-            for key, values in (("OFFS", offset), ("SCAL", triad.scale))
-            for axis, value in zip(AXES, values, strict=True)
-        )
+        values: dict[str, float] = {}
+        for key, numbers in (("OFFS", offset), ("SCAL", triad.scale)):
+            values |= {
+                f"INS_ACC{number}{key}_{axis.upper()}": float(v)
+                for axis, v in zip(AXES, numbers, strict=True)
+            }
+        if slopes is not None and result.temperature is not None:
+            header += self._thermal_notes()
+            values |= self._thermal(slopes, result.temperature)
+        lines = "".join(f"{key},{value:.9g}\n" for key, value in values.items())
         return (base.comment(header) + lines).encode()
+
+    def _thermal(self, slopes: Float, drift: Temperature) -> dict[str, float]:
+        """Return the parameters of the temperature calibration, whose polynomials are linear."""
+        from accelcal_cli.sensor.poses import AXES
+
+        name, nothing = f"INS_TCAL{self.instance + 1}", 0.0 * slopes
+        powers = enumerate((slopes * PER_COEFFICIENT, nothing, nothing), start=1)
+        return {
+            f"{name}_ENABLE": 1,
+            f"{name}_TMIN": drift.low,
+            f"{name}_TMAX": drift.high,
+            **{
+                f"{name}_ACC{p}_{axis.upper()}": float(v)
+                for p, row in powers
+                for axis, v in zip(AXES, row, strict=True)
+            },
+            f"INS_ACC{self.instance + 1}_CALTEMP": drift.reference,
+        }
+
+    def _thermal_notes(self) -> list[str]:
+        name = f"INS_TCAL{self.instance + 1}"
+        return [
+            "ArduPilot subtracts 1e-6 ACC1 (T - CALTEMP) before ACCOFFS, T in degrees Celsius, held within "
+            f"{name}_TMIN and TMAX.",
+            f"{name}_ENABLE = 1 enables the gyroscope's polynomials, {name}_GYR, as well. The others of {name} appear "
+            "once it is set: refresh the parameters and load the file again.",
+        ]
 
     def warnings(self, result: Calibration) -> tuple[str, ...]:
         """Return what is left out, and whether ArduPilot would refuse the parameters."""

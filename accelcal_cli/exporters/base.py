@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
@@ -17,12 +17,18 @@ from accelcal_cli.schema import Checked, setting
 
 if TYPE_CHECKING:  # the help of `accelcal export` does not wait for numpy
     from accelcal_cli.arrays import Float
-    from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.calibration.result import Calibration, Temperature
     from accelcal_cli.sensor.model import ErrorModel
     from accelcal_cli.sensor.triad import Triad
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
+
+Slopes = Literal["none", "bias", "all"]
+"""Which slopes with temperature a file holds: none, those of the bias, or those of the scale factors as well."""
+
+CELSIUS = (-70.0, 150.0)
+"""Temperatures of a sensor in degrees Celsius; in kelvin, or in units of a converter, they are others."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,8 @@ class Exporter(Checked, ABC):
     """Usual ending of a file of this format."""
     binary: ClassVar[bool] = False
     """Whether the content is no text, so that it cannot go to a terminal."""
+    slopes: ClassVar[Slopes] = "none"
+    """Which slopes with temperature the format has a place for."""
 
     def export(self, result: Calibration) -> Export:
         """Return a result in this format; whether its verdict allows that is the caller's concern.
@@ -57,19 +65,42 @@ class Exporter(Checked, ABC):
 
     @abstractmethod
     def content(self, result: Calibration) -> bytes:
-        """Return the file, which names its `origin`.
+        """Return the file, which begins with its `header`.
 
         Raises:
             UsageError: the format cannot hold this result.
         """
 
+    def header(self, result: Calibration) -> list[str]:
+        """Return lines that every file holds: where its numbers come from, and which temperature slopes it lacks."""
+        return [*origin(result), *(f"Warning: {text}." for text in self._slopes_left_out(result))]
+
     def warnings(self, result: Calibration) -> tuple[str, ...]:
-        """Return what the file leaves out, a sentence each: here the temperature slopes, which no format holds."""
-        if result.temperature is None:
+        """Return what the file leaves out, a sentence each: here slopes with temperature that it does not hold."""
+        return self._slopes_left_out(result)
+
+    def held(self, result: Calibration) -> Slopes:  # noqa: ARG002  # of some formats it depends on the result
+        """Return which slopes the file of a result with slopes holds."""
+        return self.slopes
+
+    def _slopes_left_out(self, result: Calibration) -> tuple[str, ...]:
+        drift, held = result.temperature, self.held(result)
+        if drift is None or held == "all":
             return ()
-        return (
-            f"temperature slopes are dropped: the numbers hold at {result.temperature.reference:.4g} degrees",
+        ends = f"{drift.low:.4g} or {drift.high:.4g} degrees"
+        size = f"{left_at_the_ends(result, drift, held):.2g} m/s^2 at 1 g at {ends}"
+        if held == "bias":
+            return (
+                "this format has temperature slopes of the bias only: those of the scale factors are left out, an "
+                f"error of up to {size}",
+            )
+        why = (
+            "this format has no temperature slopes"
+            if self.slopes == "none"
+            else f"temperature slopes are left out, because the temperatures are not degrees Celsius of "
+            f"{CELSIUS[0]:g} to {CELSIUS[1]:g}"
         )
+        return (f"{why}: the numbers hold at {drift.reference:.4g} degrees, with an error of up to {size}",)
 
 
 EXPORTERS: Registry[Exporter] = Registry(
@@ -77,6 +108,16 @@ EXPORTERS: Registry[Exporter] = Registry(
 )
 
 INSTANCE = "number of the accelerometer in the target, from 0"
+
+
+def left_at_the_ends(result: Calibration, drift: Temperature, held: Slopes) -> float:
+    """Return the largest error of the force, m/s^2 at 1 g, at the coldest or warmest pose without slopes not held."""
+    import numpy as np
+
+    span = max(drift.high - drift.reference, drift.reference - drift.low)
+    bias = 0.0 if held == "bias" else float(np.linalg.norm(result.model.K_A @ drift.bias))
+    scale = result.g * float(np.linalg.norm(result.model.K_A @ np.diag(drift.scale) @ result.K_a, 2))
+    return (scale + bias) * span * metres_per_unit(result)
 
 
 @dataclass(frozen=True)
@@ -97,7 +138,18 @@ class DriverExporter(Exporter):
             UsageError: the readings are neither, and no driver scale says what the target makes of them; or a driver
                 scale that is not that of these readings.
         """
-        from accelcal_cli.sensor.model import ErrorModel, sensitivity
+        from accelcal_cli.sensor.model import ErrorModel
+
+        unit = self.driver_unit(result)
+        return ErrorModel(result.K_a * (unit / metres_per_unit(result)), result.D_a * unit)
+
+    def driver_unit(self, result: Calibration) -> float:
+        """Return what the driver makes of one unit of the readings, m/s^2.
+
+        Raises:
+            UsageError: see `in_metres`.
+        """
+        from accelcal_cli.sensor.model import sensitivity
 
         metres = metres_per_unit(result)
         scale = sensitivity(result.K_a) / metres
@@ -108,13 +160,13 @@ class DriverExporter(Exporter):
                     f"--driver-scale {self.driver_scale:g}: the calibrated readings are {scale.mean():.6g} per m/s^2; "
                     f"expected a number within a factor of {NEAR_ONE[1]:g} of that"
                 )
-            return ErrorModel(result.K_a / metres / self.driver_scale, result.D_a / self.driver_scale)
+            return 1.0 / self.driver_scale
         if not is_force(result):
             raise UsageError(
                 f"--to {self.name} needs readings in m/s^2, and these are in output units, {scale.mean():.6g} per "
                 f"m/s^2; state with --driver-scale how many the driver takes for 1 m/s^2"
             )
-        return ErrorModel(result.K_a, result.D_a * metres)
+        return metres
 
 
 def is_mounted(result: Calibration) -> bool:
@@ -186,6 +238,17 @@ class DiagonalExporter(DriverExporter):
 
     orientation: ClassVar[str]
     """The target's parameter of the board orientation, one of ORIENTATIONS."""
+    slopes = "bias"
+
+    def held(self, result: Calibration) -> Slopes:
+        """Return that slopes of the bias are held where temperatures are degrees Celsius, as the target measures."""
+        drift = result.temperature
+        return "bias" if drift and CELSIUS[0] <= drift.low and drift.high <= CELSIUS[1] else "none"
+
+    def bias_slopes(self, result: Calibration) -> Float | None:
+        """Return the slopes of the bias, m/s^2 per degree Celsius, shape (3,); None where the file holds none."""
+        drift = result.temperature
+        return None if drift is None or self.held(result) == "none" else drift.bias * self.driver_unit(result)
 
     def triad(self, result: Calibration) -> tuple[Float, Triad]:
         """Return the offset, m/s^2, shape (3,), and the triad of readings in m/s^2."""
@@ -208,14 +271,14 @@ class DiagonalExporter(DriverExporter):
         ]
 
     def warnings(self, result: Calibration) -> tuple[str, ...]:
-        """Return the misalignments and the mounting that are left out, and what all formats leave out."""
+        """Return the misalignments, slopes with temperature, and the mounting that are left out."""
         from accelcal_cli.sensor.triad import Triad, angle
 
         triad = Triad.of(result.K_a)
         turned = triad.mirrored or angle(triad.axes) > STRAIGHT
         mounting = self._mounting(result, triad) if turned else ()
         told = (f"the mounting is not in the numbers: {text}" for text in mounting)
-        return (*self._left_out(result, triad), *told)
+        return (*self._left_out(result, triad), *super().warnings(result), *told)
 
     def _mounting(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
         return (triad.in_words(self.orientation),) if is_mounted(result) else ()
@@ -224,9 +287,8 @@ class DiagonalExporter(DriverExporter):
         from accelcal_cli.sensor.model import AXIS_PAIRS, MRAD, misalignment
         from accelcal_cli.sensor.poses import AXES
 
-        further = super().warnings(result)
         if result.held.any():
-            return further
+            return ()
         missed, metres = misalignment(result.K_a), result.g * metres_per_unit(result)
         k = int(abs(missed).argmax())
         i, j = AXIS_PAIRS[k]
@@ -235,5 +297,4 @@ class DiagonalExporter(DriverExporter):
             f"this format has no misalignments: axes {AXES[i]} and {AXES[j]} miss 90 degrees by {size * MRAD:.3g} "
             f"mrad ({size:.3f} rad), an error of {triad.rms * metres:.2g} m/s^2 rms over all directions and up to "
             f"{triad.worst * metres:.2g} m/s^2 at 1 g",
-            *further,
         )

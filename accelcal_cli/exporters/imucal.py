@@ -44,7 +44,7 @@ class Imucal(Exporter):
             "from_acc_unit": result.unit if base.is_force(result) else "a.u.",
             "from_gyr_unit": "deg/s",
             "comment": "; ".join(
-                [*base.origin(result), base.frame(result), "gyroscope not calibrated: identity"]
+                [*self.header(result), base.frame(result), "gyroscope not calibrated: identity"]
             ),
             "K_a": base.rows(np.diag(scale)),
             "R_a": base.rows(result.K_a / scale[:, None]),

@@ -40,7 +40,7 @@ class Kalibr(DriverExporter):
         else:
             model, unit = result.model.in_gauge("lower"), "unit of the readings"
         header = [
-            *base.origin(result),
+            *self.header(result),
             f"Kalibr: reading = M a + b; a in m/s^2, reading and b in {unit}, M lower triangular.",
             f"Axes of a: {base.BODY['lower']}, whatever the gauge of the result.",
         ]

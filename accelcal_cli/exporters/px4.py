@@ -1,7 +1,8 @@
 """PX4 corrects a reading of the driver, in m/s^2 and in the axes of the log, as (reading - OFF) * SCALE.
 
 It does so axis by axis, after the driver's own rotation, and turns the board afterwards
-(PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.hpp).
+(PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.hpp). Before OFF it subtracts a cubic polynomial in T - TREF,
+T held within TMIN and TMAX (TemperatureCompensation::calc_thermal_offsets_3D); its scales know no temperature.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from accelcal_cli.exporters.base import EXPORTERS, INSTANCE, DiagonalExporter
 from accelcal_cli.schema import setting
 
 if TYPE_CHECKING:
-    from accelcal_cli.calibration.result import Calibration
+    from accelcal_cli.arrays import Float
+    from accelcal_cli.calibration.result import Calibration, Temperature
 
-REAL32 = 9  # MAV_PARAM_TYPE_REAL32
+INT32, REAL32 = 6, 9  # MAV_PARAM_TYPE_INT32, MAV_PARAM_TYPE_REAL32
 
 
 @EXPORTERS.register("px4")
@@ -24,7 +26,8 @@ REAL32 = 9  # MAV_PARAM_TYPE_REAL32
 class Px4(DiagonalExporter):
     """PX4 parameters, in the file format of QGroundControl.
 
-    CAL_ACCn_XOFF, ..., CAL_ACCn_XSCALE, ...: offset D_a in m/s^2, scale of the sensor's own axis.
+    CAL_ACCn_XOFF, ..., CAL_ACCn_XSCALE, ...: offset D_a in m/s^2, scale of the sensor's own axis; TC_An_X1_0, ...:
+    slopes of the offset with temperature, where there are any.
     """
 
     orientation = "SENS_BOARD_ROT"
@@ -33,22 +36,59 @@ class Px4(DiagonalExporter):
 
     instance: int = setting(0, INSTANCE, low=0, high=3)
 
+    device_id: int | None = setting(
+        None, "device id of the accelerometer in the target, as its CAL_ACCn_ID says", low=1, high=2**31 - 1
+    )
+
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
         from accelcal_cli.sensor.poses import AXES
 
         offset, triad = self.triad(result)
-        name = f"CAL_ACC{self.instance}"
+        name, slopes = f"CAL_ACC{self.instance}", self.bias_slopes(result)
         header = [
-            *base.origin(result),
+            *self.header(result),
             "PX4: corrected = (reading - OFF) * SCALE, m/s^2, in the axes of the log.",
-            f"{name}_ID has to be the device that the readings came from.",
+            *([] if self.device_id else [f"{name}_ID has to be the device that the readings came from."]),
             *self.notes(result),
-            "Vehicle-Id Component-Id Name Value Type",
         ]
+        values: dict[str, float] = {} if self.device_id is None else {f"{name}_ID": self.device_id}
+        for key, numbers in (("OFF", offset), ("SCALE", triad.scale)):
+            values |= {f"{name}_{axis.upper()}{key}": float(v) for axis, v in zip(AXES, numbers, strict=True)}
+        if slopes is not None and result.temperature is not None:
+            header += self._thermal_notes()
+            values |= self._thermal(slopes, result.temperature)
+        header.append("Vehicle-Id Component-Id Name Value Type")
         lines = "".join(
-            f"1\t1\t{name}_{axis.upper()}{key}\t{value:.9g}\t{REAL32}\n"
-            for key, values in (("OFF", offset), ("SCALE", triad.scale))
-            for axis, value in zip(AXES, values, strict=True)
+            f"1\t1\t{key}\t{v}\t{INT32}\n" if isinstance(v, int) else f"1\t1\t{key}\t{v:.9g}\t{REAL32}\n"
+            for key, v in values.items()
         )
         return (base.comment(header) + lines).encode()
+
+    def warnings(self, result: Calibration) -> tuple[str, ...]:
+        """Return what is left out, and that PX4 needs the device of a thermal calibration."""
+        nameless = self.bias_slopes(result) is not None and self.device_id is None
+        told = f"PX4 applies temperature slopes to the device TC_A{self.instance}_ID only: state it with --device-id"
+        return (*super().warnings(result), *((told,) if nameless else ()))
+
+    def _thermal(self, slopes: Float, drift: Temperature) -> dict[str, float]:
+        """Return the parameters of the thermal compensation: the offset is linear, and none at TREF."""
+        name = f"TC_A{self.instance}"
+        powers = (0.0 * slopes, slopes, 0.0 * slopes, 0.0 * slopes)
+        return {
+            "TC_A_ENABLE": 1,
+            **({} if self.device_id is None else {f"{name}_ID": self.device_id}),
+            f"{name}_TREF": drift.reference,
+            f"{name}_TMIN": drift.low,
+            f"{name}_TMAX": drift.high,
+            **{f"{name}_X{p}_{i}": float(v) for p, row in enumerate(powers) for i, v in enumerate(row)},
+        }
+
+    def _thermal_notes(self) -> list[str]:
+        name = f"TC_A{self.instance}"
+        device = f"{name}_ID has to be the device, as CAL_ACC{self.instance}_ID. "
+        return [
+            f"PX4 subtracts X1 (T - TREF) before OFF, T in degrees Celsius, held within {name}_TMIN and TMAX.",
+            f"{'' if self.device_id else device}The others of {name} appear once TC_A_ENABLE is 1: restart PX4 and "
+            "load the file again.",
+        ]

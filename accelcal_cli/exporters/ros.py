@@ -29,7 +29,7 @@ class Ros(Exporter):
         """Return SM and bias as YAML."""
         metres = base.metres_per_unit(result)
         header = [
-            *base.origin(result),
+            *self.header(result),
             "imu_calib: corrected = SM * reading - bias, m/s^2; the reading is in the unit of the calibrated readings.",
             base.frame(result),
         ]

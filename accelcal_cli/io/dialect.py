@@ -21,8 +21,8 @@ from accelcal_cli.io.stream import LONGEST_LINE
 from accelcal_cli.io.vocabulary import (
     LAYOUTS,
     Facts,
-    describe,
-    is_time,
+    count_known,
+    is_known,
     is_unit_row,
     parse_unit,
     read_facts,
@@ -110,6 +110,12 @@ class Dialect:
     def marks(self) -> tuple[str, ...]:
         """What a line of comment begins with."""
         return MARKS if self.separator == ";" else (*MARKS, ";")
+
+    def notes(self) -> list[str]:
+        """Say what stands above the table and was understood of it, if anything does."""
+        above, facts = self.above, str(self.facts)
+        skipped = f"{above:,} line{'s' * (above != 1)} above the table skipped" if above else "comments"
+        return [skipped + f": {facts}" * bool(facts)] if above or facts else []
 
 
 @dataclass(frozen=True)
@@ -553,7 +559,7 @@ def _with_header(
     titles = [k for k in block if k not in units]
     if not titles:  # the names stand in a comment
         return Layout(first, units=tuple(block[max(units)]))
-    header = max(titles, key=lambda k: (_score(block[k]), k))
+    header = max(titles, key=lambda k: (count_known(block[k]), k))
     below = next((tuple(block[k]) for k in units if k > header and any(map(_says, block[k]))), None)
     names = _grouped(block.get(header - 1) if header - 1 in titles else None, block[header])
     return Layout(first, tuple(names[:-1] if _ends_in_remark(names, width) else names), header, below)
@@ -575,16 +581,6 @@ def _ends_in_remark(names: Sequence[str], width: int) -> bool:
 
 def _says(unit: str) -> bool:
     return parse_unit(unit) not in (None, "-")
-
-
-def _score(names: Sequence[str]) -> int:
-    """Return how many cells of a line are names that are known."""
-    return sum(bool(name) and (is_time(name) or describe(name).is_axis) for name in names)
-
-
-def is_known(names: Sequence[str]) -> bool:
-    """Return whether cells are names of columns, of which some say what they are."""
-    return len(names) > 1 and _score(names) > 1
 
 
 def _grouped(groups: Sequence[str] | None, names: Sequence[str]) -> Sequence[str]:

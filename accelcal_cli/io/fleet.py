@@ -260,11 +260,9 @@ def read_fleet(
         DataError: a fault of the input, with its place.
         UsageError: a fault of `columns`, `sensor` or `where`, or a file twice.
     """
-    for k, source in enumerate(sources):
-        if source in sources[:k]:
-            raise UsageError(f"{source}: is given twice")
+    check_once(sources)
     each = len(sources) > 1 and sensor is None
-    names = _file_names(sources) if each else [None] * len(sources)
+    names: Sequence[str | None] = file_names(sources) if each else [None] * len(sources)
     collector = _FleetCollector()
     for source, name in zip(sources, names, strict=True):
         table = open_table(source, stdin, options=options)
@@ -284,7 +282,14 @@ def read_fleet(
     return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras, zeros)
 
 
-def _file_names(sources: Sequence[str]) -> Sequence[str | None]:
+def check_once(sources: Sequence[str]) -> None:
+    """Raise UsageError where a file is given twice."""
+    for k, source in enumerate(sources):
+        if source in sources[:k]:
+            raise UsageError(f"{source}: is given twice")
+
+
+def file_names(sources: Sequence[str]) -> Sequence[str]:
     """Return a name for each file: its own without the ending, with as many folders as tell them apart."""
     paths = [Path(source) for source in sources]
     names = [path.stem for path in paths]

@@ -1,4 +1,4 @@
-"""Parquet tables, read with polars, and Parquet logs rewritten as Parquet or as text."""
+"""Parquet tables, read with polars; Parquet logs rewritten as Parquet or as text, and text logs as Parquet."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection
+from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection, TextTable
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.rows import RowBlock, RowFilter
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
@@ -21,6 +22,14 @@ from accelcal_cli.io.vocabulary import Facts
 
 ROWS = 500_000
 """Rows of a block."""
+
+WHOLE, NAME_OF_DIGITS = r"^-?(0|[1-9][0-9]*)$", r"^-?0[0-9]"
+"""Cells that are whole numbers, and cells such as 007, which are names though they are digits."""
+
+Cells = TypeVar("Cells", pl.Series, pl.Expr)
+
+GROUP = 100_000
+"""Rows that are written at once: groups of polars' own choice are larger the longer the table is."""
 
 PREVIEW = 2000
 """Rows that the columns are told by where their names do not."""
@@ -130,9 +139,7 @@ class ParquetTable:
                 copy.write(block)
             copy.flush()
         except OSError as problem:
-            raise DataError(
-                f"{self.name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})"
-            ) from problem
+            raise no_room(self.name, problem) from problem
         return Path(copy.name)
 
     def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
@@ -167,6 +174,11 @@ def _row(row: int) -> str:
     return f"row {row + 1}"
 
 
+def no_room(name: str, problem: OSError) -> DataError:
+    """Return what to raise where a working copy of an input cannot be written."""
+    return DataError(f"{name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})")
+
+
 @contextmanager
 def _named_errors(name: str) -> Iterator[None]:
     """Raise what polars finds wrong with a file as DataError; a panic of its decoder is no subclass of its errors."""
@@ -181,9 +193,13 @@ def frames(table: InputTable, change: Change) -> Iterator[pl.DataFrame]:
     """Yield the changed log, block after block."""
     assert isinstance(table, ParquetTable)
     for frame, rows in table.pairs(change.selection):
-        values = np.ascontiguousarray(change.compute(rows.numbers).T)
-        new = [pl.Series(name, column) for name, column in zip(change.names, values, strict=True)]
-        yield change.put(frame, new)
+        yield _changed(frame, rows, change)
+
+
+def _changed(frame: pl.DataFrame, rows: RowBlock, change: Change) -> pl.DataFrame:
+    values = np.ascontiguousarray(change.compute(rows.numbers).T)
+    new = [pl.Series(name, column) for name, column in zip(change.names, values, strict=True)]
+    return change.put(frame, new)
 
 
 def to_text(table: InputTable, change: Change, file: IO[bytes]) -> None:
@@ -197,12 +213,27 @@ def to_parquet(table: InputTable, change: Change, file: IO[bytes]) -> None:
     """Write the changed log as Parquet, by the name of the file if it has one.
 
     Raises:
+        DataError: a cell that is wrong, by its line and column, or no room for a working copy.
         OSError: it cannot be written.
     """
+    target = file.name if isinstance(file.name, str) else file  # an open descriptor has a number for a name
+    if isinstance(table, ParquetTable):
+        with system_errors():
+            _sink(frames(table, change), target)
+        return
+    assert isinstance(table, TextTable)
+    cells = TextCells(table, change)
+    with tempfile.TemporaryDirectory(prefix="accelcal-") as folder:
+        parts = cells.keep(Path(folder))
+        with system_errors():
+            _sink(cells.typed(parts), target)
+
+
+def _sink(blocks: Iterator[pl.DataFrame], target: str | IO[bytes]) -> None:
+    """Write blocks as they come."""
     from polars.io.plugins import register_io_source
 
     fault: list[BaseException] = []
-    blocks = frames(table, change)
     first = next(blocks)
 
     def source(*_: Any) -> Iterator[pl.DataFrame]:
@@ -212,8 +243,87 @@ def to_parquet(table: InputTable, change: Change, file: IO[bytes]) -> None:
         except BaseException as problem:  # polars would wrap it beyond recognition
             fault.append(problem)
 
-    target = file.name if isinstance(file.name, str) else file  # an open descriptor has a number for a name
-    with system_errors():
-        register_io_source(source, schema=first.schema).sink_parquet(target)
+    register_io_source(source, schema=first.schema).sink_parquet(target, row_group_size=GROUP)
     if fault:
         raise fault[0]
+
+
+class TextCells:
+    """The cells of a text log as columns: what all rows tell whether a column is of whole numbers, numbers or text."""
+
+    def __init__(self, table: TextTable, change: Change) -> None:
+        """Take over a log that has not been read, and what to do to it."""
+        self.table, self.change = table, change
+        dialect, numbers = table.dialect, change.selection.numbers
+        texts = tuple(k for k in range(dialect.width) if k not in numbers)
+        self.selection = replace(change.selection, texts=texts, gaps=change.selection.gaps | set(texts))
+        self.names = _names(dialect.names or (), dialect.width)
+        self.kinds: dict[str, type[pl.DataType]] = {self.names[k]: pl.Null for k in texts}
+
+    def keep(self, folder: Path) -> list[Path]:
+        """Write the changed log, block after block, to files, and learn what its columns are."""
+        parts: list[Path] = []
+        for frame in self._frames():
+            parts.append(folder / f"{len(parts)}.arrow")
+            try:
+                with system_errors():
+                    frame.write_ipc(parts[-1], compression="lz4")
+            except OSError as problem:
+                raise no_room(self.table.name, problem) from problem
+        return parts
+
+    def typed(self, parts: Sequence[Path]) -> Iterator[pl.DataFrame]:
+        """Yield the blocks again, with the columns that hold numbers in all rows as such."""
+        numbers = [
+            self._plain(pl.col(name)).cast(kind)
+            for name, kind in self.kinds.items()
+            if kind in (pl.Int64, pl.Float64)
+        ]
+        for part in parts:
+            yield pl.read_ipc(part).with_columns(numbers)
+
+    def _frames(self) -> Iterator[pl.DataFrame]:
+        """Yield the changed log; cells that are not computed are text as yet, none where they are empty."""
+        for rows in self.table.blocks(self.selection):
+            numbers = dict(zip(self.selection.numbers, np.ascontiguousarray(rows.numbers.T), strict=True))
+            texts = dict(zip(self.selection.texts, rows.texts, strict=True))
+            columns = []
+            for k, name in enumerate(self.names):
+                if k in numbers:
+                    columns.append(pl.Series(name, numbers[k]))
+                    continue
+                cells = pl.Series(name, texts[k], dtype=pl.String)
+                columns.append(cells.set(cells == "", None))
+                self.kinds[name] = self._kind(columns[-1], self.kinds[name])
+            yield _changed(pl.DataFrame(columns), rows, self.change)
+
+    def _kind(self, cells: pl.Series, so_far: type[pl.DataType]) -> type[pl.DataType]:
+        """Return what a column is after some more cells; digits behind a leading zero are no number but a name."""
+        if cells.null_count() == len(cells):
+            return so_far
+        if so_far in (pl.Null, pl.Int64):
+            if cells.str.contains(WHOLE).all() and _fits(cells, pl.Int64):
+                return pl.Int64
+            so_far = pl.Float64
+        named = cells.str.contains(NAME_OF_DIGITS).any() or (
+            self.table.dialect.decimal_comma and cells.str.contains(".", literal=True).any()
+        )
+        if so_far == pl.Float64 and not named and _fits(self._plain(cells), pl.Float64):
+            return pl.Float64
+        return pl.String
+
+    def _plain(self, cells: Cells) -> Cells:
+        return cells.str.replace(",", ".", literal=True) if self.table.dialect.decimal_comma else cells
+
+
+def _fits(cells: pl.Series, kind: type[pl.DataType]) -> bool:
+    return cells.cast(kind, strict=False).null_count() == cells.null_count()
+
+
+def _names(names: Sequence[str], width: int) -> list[str]:
+    """Return a name for each of `width` columns: its own, its number from 1 where it has none, and no name twice."""
+    made: list[str] = []
+    for k in range(width):
+        name = names[k] if k < len(names) and names[k] else str(k + 1)
+        made.append(name if name not in made else f"{name}_{k + 1}")
+    return made

@@ -81,8 +81,10 @@ class Selection:
     """Columns to read, counted from 0."""
 
     numbers: tuple[int, ...]
-    gaps: frozenset[int] = frozenset()  # columns whose cells may be empty or nan
-    texts: tuple[int, ...] = ()  # columns read as text: labels, which no row may lack
+    gaps: frozenset[int] = frozenset()  # columns whose cells may be empty, or nan where they are numbers
+    texts: tuple[
+        int, ...
+    ] = ()  # columns read as text: labels, which no row may lack unless they are among the gaps
     needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
     carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
 
@@ -219,16 +221,10 @@ class TextTable:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped, in sentences; complete once all blocks have been read."""
-        above, facts = self.dialect.above, str(self.facts)
         notes = [f"read as {' in '.join(reversed(self._source.forms))}"] * bool(self._source.forms)
         if self._options.skip_rows:
             notes.append(f"the first {self._options.skip_rows:,} lines skipped (--skip-rows)")
-        if above or facts:
-            plural = "s" * (above != 1)
-            notes.append(
-                (f"{above:,} line{plural} above the table skipped" if above else "comments")
-                + f": {facts}" * bool(facts)
-            )
+        notes += self.dialect.notes()
         if self._words is not None and (note := self._words.note()):
             notes.append(note)
         return (*notes, *self.passed.notes())
@@ -346,7 +342,7 @@ class CarefulParser:
                 text.append(label)
             self.row += 1
         numbers = np.frombuffer(values, dtype=np.float64) if values else np.empty(0)
-        return RowBlock(start, numbers.reshape(-1, len(self.selection.numbers)), texts)
+        return RowBlock(start, numbers.reshape(self.row - start, len(self.selection.numbers)), texts)
 
     def _few_are_broken(self, lines: Iterable[bytes]) -> bool:
         """Return whether --skip-bad would leave out this row, going by the rows so far and the next lines."""
@@ -441,7 +437,7 @@ class CarefulParser:
         raise DataError(f"{self._place(column)}: {_describe_cell(cell, value, self.dialect.decimal_comma)}")
 
     def _label(self, cell: str, column: int) -> str:
-        if cell:
+        if cell or column in self.selection.gaps:
             return cell
         raise DataError(f"{self._place(column)}: {NO_LABEL}")
 
@@ -504,10 +500,11 @@ class FastParser:
         numbers = np.array(
             [column.to_numpy() for column in series]
         ).T  # column after column: faster to reduce
-        if not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
+        if series and not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
             return None
-        texts = tuple([(cell or "").strip() for cell in frame[str(k)].to_list()] for k in selection.texts)
-        return RowBlock(self.careful.skip(len(frame)), numbers, texts) if all(map(all, texts)) else None
+        texts = tuple(frame[str(k)].str.strip_chars().fill_null("").to_list() for k in selection.texts)
+        whole = all(k in selection.gaps or all(text) for k, text in zip(selection.texts, texts, strict=True))
+        return RowBlock(self.careful.skip(len(frame)), numbers, texts) if whole else None
 
     def _frame(self, block: bytes) -> pl.DataFrame | None:
         import polars as pl

@@ -21,9 +21,12 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.columns import Columns, are_no_counts, choose, restrict
 from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, open_table
 from accelcal_cli.io.rows import DeadColumns, OneSensor, RowBlock, ZeroRows
-from accelcal_cli.io.screening import LOOKED_AT, Screened
+from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 from accelcal_cli.notices import Notice
+
+HEAD = 1024
+"""Rows of labelled poses that are kept to see in what steps the readings come."""
 
 STUCK = 1_000_000
 """Equal readings in a row after which an input is not read on."""
@@ -225,6 +228,7 @@ class Collector:
         others = 3 * (columns.reference is not None) + (columns.temperature is not None)
         self._means = None if columns.label is None else LabelledMeans[str](source, 3 + others)
         self._extras: list[Float] | None = [] if columns.extras else None
+        self._behind: Behind | None = None
 
     def add(self, rows: RowBlock) -> None:
         """Add one block."""
@@ -242,6 +246,9 @@ class Collector:
             self._refuse_equal(f"the first {self.rows:,} readings are all equal")
         if self._means is not None:
             count, scatter, others = self.columns.split(extras)
+            if count is None and scatter is None:
+                head = output[:HEAD].copy() if self._behind is None else self._behind.head
+                self._behind = Behind(head, self.lower, self.upper)
             self._means.add(rows.texts[0], np.hstack([output, others]), count, scatter)
             return
         self.store.append(output)
@@ -323,6 +330,7 @@ class Collector:
             timed=self.columns.time is not None,
             count=None if count is None else count[: len(first)],
             scatter=None if scatter is None else scatter[: len(first)],
+            behind=self._behind,
         )
 
     def _line_of(self, where: Callable[[int], str]) -> Callable[[int], str]:

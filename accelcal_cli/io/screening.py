@@ -2,11 +2,8 @@
 
 `Screened` are the poses of one sensor, or the first `LOOKED_AT` of them; its `notices` name zeros, copies, dead and
 equal axes, clipping, gravity that is missing, a sensor that was never turned, two sensors in one table, and rows of a
-log. `needs_look` says cheaply which of R sensors to screen. Raw logs are screened by detection/log_screening.py.
-
-Noise and resolution are measured on the readings themselves: `Surface` is the quadric nearest to all poses, and
-`grid_step` the step that all values are multiples of. A pattern is reported where noise and resolution together
-would show it in fewer than `CHANCE` of honest sets.
+log. `needs_look` says cheaply which of R sensors to screen. Raw logs are screened by detection/log_screening.py; what
+values that repeat may mean is said by ties.py.
 """
 
 from __future__ import annotations
@@ -16,19 +13,27 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.io.rows import SHOWN, named
+from accelcal_cli.io.ties import (
+    FEWEST,
+    FINER,
+    FITTED,
+    Ties,
+    coarsest_step,
+    exact,
+    grid_step,
+    quadric_terms,
+    unscattered,
+)
 from accelcal_cli.notices import COMMAND, Notice
 
 LOOKED_AT = 4096
 """Poses that are looked at: the first."""
-
-CHANCE = 5e-4
-"""Greatest chance of a pattern in honest readings at which it is reported."""
 
 RAW_ROWS = 500
 """From so many rows on, rows with a time each, or each much like the one before, are a raw log rather than poses."""
@@ -47,17 +52,8 @@ rows jump, by JUMP times the usual."""
 MANY_COPIES, SOME_COPIES = 1 / 3, 0.1
 """Parts of the poses from which on copies matter: where readings without noise may repeat, and where they cannot."""
 
-FEWEST = 12
-"""Poses that show the noise: a quadric has nine parameters."""
-
 FIXED = 0.02
 """Least singular value of the terms of a quadric over the greatest at which poses fix it."""
-
-FITTED = 1024
-"""Poses at most that the quadric is fitted to."""
-
-MOST_PARTS = 65
-"""The least difference of two readings is looked for a resolution in fewer parts than this."""
 
 ONE_POINT = 0.05
 """A range of the readings below this part of their size is less than 3 degrees: the sensor was not turned."""
@@ -73,42 +69,35 @@ TWICE, SMALLEST = 2.0, 1e-6
 """Two sensors are suspected only where separate fits leave less than half the residual, and one fit leaves squares of
 more than the second per pose, in parts of the squared radius: half a milli-g."""
 
-RARE = 2e-5
-"""Least chance that is taken for a tie of two readings."""
-
-SCALE_SPREAD = 0.06
-"""Range in which scale factor and bias put the reading of 1 g, relative: how likely a face meets the rail by chance."""
-
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Pairs of axes."""
+
+LIVELY = 10.0
+"""A scatter that is stated tells readings without any where the others are so many of its own last digits."""
+
+COARSE = 2.0
+"""Steps over the scatter of the readings from which on an average of many is no finer than one: the noise is below
+0.4 of a step."""
 
 Where = Callable[[int], str]
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """The quadric nearest to some poses, and how far they are off it.
+class Behind(NamedTuple):
+    """Single readings behind poses that are means: the first of them in time, shape (n, 3), and the extremes of all."""
 
-    Attributes:
-        noise: standard deviation of one axis, shape (3,), sensor units.
-    """
+    head: Float
+    low: Float
+    high: Float
 
-    noise: Float
+    def and_also(self, readings: Float, most: int) -> Behind:
+        """Return them with more readings, shape (n, 3), of which as many are kept as make `most` in all."""
+        head = np.concatenate([self.head, readings[: max(0, most - len(self.head))]])
+        low, high = np.minimum(self.low, readings.min(axis=0)), np.maximum(self.high, readings.max(axis=0))
+        return Behind(head, low, high)
 
-    @classmethod
-    def of(cls, output: Float) -> Self | None:
-        """Return the surface of poses, shape (J, 3), None where they are too few or an axis is constant."""
-        output = output[:: max(1, len(output) // FITTED)]
-        terms = _terms(output)
-        if terms is None:
-            return None
-        x, half, poses = terms[:, 6:9], np.ptp(output, axis=0) / 2, len(output)
-        _, singular, right = np.linalg.svd(terms, full_matrices=False)
-        a = right[-1]
-        square = np.array([[2 * a[0], a[3], a[4]], [a[3], 2 * a[1], a[5]], [a[4], a[5], 2 * a[2]]])
-        slope = math.sqrt(float(np.mean(np.sum((x @ square + a[6:9]) ** 2, axis=1))))
-        off = singular[-1] / math.sqrt(max(poses - 9, 1)) / max(slope, 1e-300)
-        return cls(off * half)
+
+NOTHING = Behind(np.zeros((0, 3)), np.full(3, np.inf), np.full(3, -np.inf))
+"""Before the first reading."""
 
 
 def thickness(output: Float) -> float:
@@ -130,32 +119,6 @@ def _thickness(output: Float) -> float:
     return math.sqrt(float((off**2).sum()) / (len(x) - 4))
 
 
-def _terms(output: Float) -> Float | None:
-    """Return the ten terms of a quadric, shape (J, 10), of poses brought to -1 to 1; None where they tell nothing."""
-    low, high = output.min(axis=0), output.max(axis=0)
-    if len(output) < FEWEST or not (high > low).all():
-        return None
-    x, y, z = ((output - (low + high) / 2) / ((high - low) / 2)).T
-    return np.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, np.ones_like(x)], axis=1)
-
-
-def grid_step(*axes: Float) -> float:
-    """Return the step of which all differences of values within an axis are multiples, 0 where there is none."""
-    values = [np.unique(axis) for axis in axes]
-    gaps = np.concatenate([np.diff(axis) for axis in values])
-    if len(gaps) < 2:
-        return float(gaps.sum())
-    least = float(gaps[gaps > 1e-12 * max(float(np.ptp(axis)) for axis in values)].min())
-    for step in (*(least / k for k in range(1, MOST_PARTS)), *(10.0**-k for k in range(9))):
-        if all(_are_whole(part / step) for part in (gaps[:32], gaps)) and (len(gaps) > 5 or step < least):
-            return step
-    return 0.0
-
-
-def _are_whole(numbers: Float) -> bool:
-    return bool((np.abs(numbers - np.round(numbers)) < 0.02).all())
-
-
 @dataclass(frozen=True, eq=False)
 class Screened:
     """Poses of one sensor, to be screened.
@@ -166,6 +129,7 @@ class Screened:
         single: whether each row of a table is a pose; timed: whether the rows have times.
         warm: whether they have temperatures, with which one sensor may drift from the first half to the second.
         count: readings behind each pose, shape (J,); scatter: standard deviation of one, shape (J, 3); or None.
+        behind: the readings behind the poses; None where they are not known.
     """
 
     output: Float
@@ -178,44 +142,66 @@ class Screened:
     warm: bool = False
     count: Float | None = None
     scatter: Float | None = None
+    behind: Behind | None = None
 
     def notices(self) -> tuple[Notice, ...]:
         """Return what the readings show, warnings first."""
         dead = list(self._dead_axes())
-        if not dead and (self.never_moved or self.gravity_removed):
+        frozen = [] if dead else list(self._frozen())
+        if not dead and (self.never_moved or (self.gravity_removed and not frozen)):
             return tuple(self._one_point())
-        found = [*self._log(), *dead, *self._copies()]
+        found = [*self._log(), *dead, *self._copies(), *frozen]
         if not dead:
-            found += [*self._several(), *self._clipped(), *self._frozen()]
+            found += [*self._clipped(), *self._quantised(), *(() if frozen else self._several())]
         return tuple(sorted(found, key=lambda notice: notice.severity != "warning"))
 
     @cached_property
-    def surface(self) -> Surface | None:
-        """The quadric nearest to the poses."""
-        return Surface.of(self.output)
+    def ties(self) -> Ties:
+        """How the values of the poses repeat."""
+        steps = self._row_steps
+        steps = np.where(steps > self._usual_scatter / FINER, steps, 0.0)
+        low, high = (None, None) if self.behind is None else (self.behind.low, self.behind.high)
+        return Ties(exact(self.output), steps, low, high)
 
     @cached_property
-    def steps(self) -> Float:
-        """Resolution of each axis, shape (3,), 0 where none shows: its own, or the one of all where that is coarser."""
-        return np.maximum(grid_step(*self.output.T), [grid_step(axis) for axis in self.output.T])
+    def _usual_scatter(self) -> Float:
+        """Root mean square of the scatter, shape (3,), 0 where it is not known."""
+        known = self.scatter is not None and bool(np.isfinite(self.scatter).any())
+        return (
+            np.sqrt(np.nanmean(self.scatter**2, axis=0))
+            if self.scatter is not None and known
+            else np.zeros(3)
+        )
 
     @cached_property
-    def tie(self) -> Float:
-        """Chance that two poses of one attitude read the same on an axis, shape (3,): 1 without noise.
+    def _row_steps(self) -> Float:
+        """Steps in which the readings behind the poses come, shape (3,), 0 where they are not known."""
+        return (
+            np.zeros(3)
+            if self.behind is None
+            else np.array([coarsest_step(axis) for axis in self.behind.head.T])
+        )
 
-        Rounding to a step is in the noise that the poses show: where that is below the step, it may be all of it.
+    @cached_property
+    def _clipped_at(self) -> list[tuple[int, int]]:
+        """Axis and pose of every reading at the end of a range.
+
+        A clipped reading makes its pose shorter; poses that are longer than others have an axis that is stuck.
         """
-        if self.surface is None:
-            return np.ones(3)
-        step = np.maximum(self.steps, 1e-12 * np.abs(self.output).max(axis=0))
-        noise = np.maximum(self.surface.noise, 1e-300)
-        # The difference of two normal readings has a density of 1 / (2 sqrt(pi) sigma) at zero.
-        return np.where(noise < step, 1.0, np.minimum(1.0, step / (2 * math.sqrt(math.pi) * noise)))
-
-    @cached_property
-    def copies(self) -> int:
-        """How many poses repeat an earlier one to the last digit."""
-        return len(self.output) - len({row.tobytes() for row in self.output})
+        marks: dict[tuple[int, float], set[int]] = {}
+        for pose, axis, value in self.ties.at_ends():
+            marks.setdefault((axis, value), set()).add(pose)
+        output = self.ties.output
+        flat = self._unscattered & ((output == output.min(axis=0)) | (output == output.max(axis=0)))
+        flat[self._unscattered.all(axis=1)] = False
+        for pose, axis in np.argwhere(flat).tolist():
+            marks.setdefault((axis, float(output[pose, axis])), set()).add(pose)
+        return [
+            (axis, pose)
+            for (axis, value), poses in marks.items()
+            if self.ties.is_end(axis, value) and not self.ties.are_longer(np.array(sorted(poses)))
+            for pose in sorted(poses)
+        ]
 
     @property
     def never_moved(self) -> bool:
@@ -226,7 +212,7 @@ class Screened:
     @property
     def gravity_removed(self) -> bool:
         """Whether the poses fill a volume instead of a surface."""
-        return self.surface is not None and thickness(self.output) > NO_SURFACE and self._is_one_blob()
+        return self.ties.surface is not None and thickness(self.output) > NO_SURFACE and self._is_one_blob()
 
     def _is_one_blob(self) -> bool:
         """Whether distances from the middle spread as those of noise, not as those of a sphere with a few outliers."""
@@ -284,12 +270,12 @@ class Screened:
                 yield Notice("dead-axis", "warning", text, "Name the columns of three axes with --columns.")
 
     def _copies(self) -> Iterator[Notice]:
-        poses, copies = len(self.output), self.copies
+        poses, copies = len(self.output), self.ties.copies
         if copies < max(2, SOME_COPIES * poses):
             return
         text = f"{copies:,} of {poses:,} poses repeat another to the last digit."
-        expected = float(np.prod(self.tie)) * self._near_pairs()
-        if copies > 3 + 5 * expected or (copies >= MANY_COPIES * poses and not (self.steps > 0).all()):
+        expected = float(np.prod(self.ties.tie)) * self.ties.near_pairs()
+        if copies > 3 + 5 * expected or (copies >= MANY_COPIES * poses and not (self.ties.steps > 0).all()):
             text += " Sigma counts them as independent measurements."
             yield Notice("duplicate-rows", "warning", text, "Leave copies out.")
         elif copies >= MANY_COPIES * poses:
@@ -298,21 +284,12 @@ class Screened:
             )
             yield Notice("duplicate-rows", "note", text, "Average many readings of each pose.")
 
-    def _near_pairs(self) -> float:
-        """Return about how many pairs of poses are one attitude within the noise."""
-        if self.surface is None:
-            return 0.5 * len(self.output) ** 2
-        width = 4 * np.maximum(np.maximum(self.surface.noise, self.steps), 1e-9 * np.ptp(self.output, axis=0))
-        cells = np.round(self.output / width)
-        _, count = np.unique(cells, axis=0, return_counts=True)
-        return float((count * (count - 1) / 2).sum())
-
     def _clipped(self) -> Iterator[Notice]:
-        marks = Rails(self).marked()
+        marks = self._clipped_at
         if not marks:
             return
-        poses = sorted({pose for pose, _, _ in marks})
-        sides = sorted({(axis, value) for _, axis, value in marks})
+        poses = sorted({pose for _, pose in marks})
+        sides = sorted({(axis, float(self.ties.output[pose, axis])) for axis, pose in marks})
         ends = ", ".join(f'"{self.names[axis]}" at {value:.10g}' for axis, value in sides)
         places = named([self.where(pose) for pose in poses[:SHOWN]], len(poses))
         yield Notice(
@@ -324,25 +301,64 @@ class Screened:
         )
 
     def _frozen(self) -> Iterator[Notice]:
-        """Poses without any scatter, in all axes at once, or in one axis alone, where every other has some."""
-        if self.scatter is None or len(self.output) < FEWEST:
-            return
-        zero = (self.scatter == 0) & (True if self.count is None else self.count[:, None] > 2)
+        """Poses without any scatter, in all axes or in one, where others have some, and axes that do not turn."""
+        zero = self._unscattered.copy()
         whole = zero.all(axis=1)
-        alone = zero.sum(axis=0)
-        number = int(zero.sum())
-        if whole.any() and number == 3 * whole.sum() and 2 * whole.sum() < len(whole):
+        if whole.any():
             yield self._frozen_notice(np.flatnonzero(whole), "all axes repeat one value")
-        elif number > FEWEST // 2 and number == alone.max() < len(whole) - FEWEST // 2:
-            axis = int(alone.argmax())
-            if not Rails(self).marked():
-                poses = np.flatnonzero(zero[:, axis])
-                yield self._frozen_notice(poses, f'column "{self.names[axis]}" repeats one value')
+        zero[whole] = False
+        for axis, pose in self._clipped_at:
+            zero[pose, axis] = False
+        for axis, first, end in self.ties.stuck():
+            zero[first:end, axis] = True
+        for axis in np.flatnonzero(zero.any(axis=0)).tolist():
+            poses = np.flatnonzero(zero[:, axis])
+            yield self._frozen_notice(poses, f'column "{self.names[axis]}" repeats one value')
+
+    @cached_property
+    def _unscattered(self) -> Bool:
+        """Return the poses and axes without scatter although they should have some, shape (J, 3)."""
+        nothing = np.zeros(self.output.shape, dtype=bool)
+        if self.scatter is None or len(self.output) < FEWEST:
+            return nothing
+        count = np.full(len(self.output), np.inf) if self.count is None else self.count
+        scatter = np.where(self.scatter > 1e-12 * np.abs(self.output).max(), self.scatter, 0.0)
+        if self.behind is not None:
+            return unscattered(scatter, count, self.behind.head)
+        zero = (scatter == 0) & (count[:, None] > 2)
+        whole, number = zero.all(axis=1), int(zero.sum())
+        if number == 3 * whole.sum() and 2 * whole.sum() < len(whole):
+            return np.asarray(zero)
+        alone, others = zero.sum(axis=0), scatter[scatter > 0]
+        if not len(others) or np.median(others) < LIVELY * grid_step(scatter.ravel()):
+            return nothing
+        one_axis = FEWEST // 2 < number == alone.max() < len(whole) - FEWEST // 2
+        return np.asarray(zero) if one_axis else nothing
 
     def _frozen_notice(self, poses: Int, what: str) -> Notice:
         places = named([self.where(pose) for pose in poses[:SHOWN].tolist()], len(poses))
-        text = f"Frozen readings: {what} to the last digit in {len(poses)} poses ({places}), while others scatter."
+        plural = "s" if len(poses) > 1 else ""
+        text = (
+            f"Frozen readings: {what} to the last digit in {len(poses):,} pose{plural} ({places}), while others "
+            "change."
+        )
         return Notice("frozen", "warning", text, "Leave these poses out, or measure them again.")
+
+    def _quantised(self) -> Iterator[Notice]:
+        """Steps so much coarser than the noise that an average of many readings is off by as much as one."""
+        if self.behind is None or self.scatter is None:
+            return
+        step = self._row_steps
+        coarse = np.flatnonzero(step > COARSE * self._usual_scatter)
+        if len(coarse):
+            names = ", ".join(f'"{self.names[axis]}"' for axis in coarse.tolist())
+            text = (
+                f"Column {names} changes in steps of {float(step[coarse].max()):.4g}, coarser than the noise: the mean "
+                "of a pose is off by up to half a step, however many readings it has. Sigma counts that as noise."
+            )
+            yield Notice(
+                "quantised", "note", text, "Choose a finer resolution or a narrower range of the sensor."
+            )
 
     def _several(self) -> Iterator[Notice]:
         poses = len(self.output)
@@ -386,7 +402,7 @@ def _block_steps(means: Float, row: Float, blocks: int) -> tuple[Float, Float]:
 
 def _fit_apart(output: Float, part: Bool) -> bool:
     """Return whether two quadrics, one for each part of the poses, fit beyond chance better than one for all."""
-    terms = _terms(output)
+    terms = quadric_terms(output)
     if terms is None or len(output) < 2 * FEWEST:
         return False
     squares, freedom = 0.0, len(output) - 18
@@ -419,91 +435,6 @@ def _squares(terms: Float) -> float:
     return max(float(target @ target - (parts**2 / values).sum()), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Rails:
-    """Which poses read exactly the end of a range, on which axis."""
-
-    screened: Screened
-
-    def marked(self) -> list[tuple[int, int, float]]:
-        """Return (pose, axis, value) of every clipped reading."""
-        output = self.screened.output
-        if self.screened.copies:
-            output = np.unique(output, axis=0)
-        if len(output) < 6:
-            return []
-        marks = []
-        for values in self._groups(output):
-            tied = [(a, v, int(np.count_nonzero(output[:, a] == v))) for a, v in values]
-            if self._chance(output, tied) < CHANCE:
-                marks += [
-                    (pose, axis, value)
-                    for axis, value, _ in tied
-                    for pose in np.flatnonzero(self.screened.output[:, axis] == value).tolist()
-                ]
-        return marks
-
-    def _groups(self, output: Float) -> list[list[tuple[int, float]]]:
-        """Return the extremes (axis, value) in groups that are one range: the same size, or -2^n and 2^n - 1."""
-        groups: dict[float, list[tuple[int, float]]] = {}
-        for axis in range(3):
-            for value in (float(output[:, axis].min()), float(output[:, axis].max())):
-                size = abs(value) if bits_of_rail(value) is None else 2.0 ** (bits_of_rail(value) or 0)
-                groups.setdefault(size, []).append((axis, value))
-        return list(groups.values())
-
-    def _chance(self, output: Float, tied: list[tuple[int, float, int]]) -> float:
-        """Return about how often honest poses would meet these extremes so many times.
-
-        Poses of one side meet by their noise; the ends of two sides meet by scale factors and biases, which are alike.
-        """
-        number, sides = sum(m for _, _, m in tied), len(tied)
-        if number < 2:
-            return 1.0
-        equal, near = _ties_elsewhere(output, tied, self.screened.surface)
-        tie = min(1.0, max(float(self.screened.tie.max()) * near, equal, RARE))
-        spread = max(SCALE_SPREAD * abs(tied[0][1]), 1e-300)
-        ends = min(1.0, max(tie, float(self.screened.steps.max()) / spread))
-        chance = 1.0
-        if len(output) >= FEWEST:
-            chance = math.comb(6, sides) * ends ** (sides - 1) * tie ** (number - sides)
-        bits = [bits_of_rail(value) for _, value, _ in tied]
-        whole = bool((output == np.round(output)).all())
-        if (
-            whole
-            and bits[0] is not None
-            and output.min() >= -(2.0 ** bits[0])
-            and output.max() < 2.0 ** bits[0]
-        ):
-            hit = min(1.0, 1 / (SCALE_SPREAD * 2.0 ** bits[0]))
-            chance = min(chance, math.comb(6, sides) * hit**sides * min(1.0, tie) ** (number - sides))
-        return chance
-
-
-def bits_of_rail(value: float) -> int | None:
-    """Return n where a value is the end of a binary range, 2^n - 1 or -2^n."""
-    size = value + 1 if value > 0 else -value
-    mantissa, exponent = math.frexp(size)
-    return exponent - 1 if mantissa == 0.5 and exponent > 7 else None
-
-
-def _ties_elsewhere(
-    output: Float, tied: list[tuple[int, float, int]], surface: Surface | None
-) -> tuple[float, float]:
-    """Return the parts of neighbouring values, apart from these extremes, that are equal and that are near.
-
-    Near means within the noise: the attitudes of the poses are alike in this axis, as in symmetrical sets.
-    """
-    equal, near, total = 0, 1, 1
-    for axis, values in enumerate(output.T):
-        own = [value for a, value, _ in tied if a == axis]
-        gaps = np.diff(np.sort(values[~np.isin(values, own)]))
-        width = math.inf if surface is None else 4 * surface.noise[axis]
-        equal, total = equal + int(np.count_nonzero(gaps == 0)), total + len(gaps)
-        near += int(np.count_nonzero(gaps <= width))
-    return equal / total, near / total
-
-
 def needs_look(output: Float, poses: Int) -> Bool:
     """Return which of R sensors to screen, shape (R,): all of those of which `Screened` has something to say.
 
@@ -521,6 +452,7 @@ def needs_look(output: Float, poses: Int) -> Bool:
         np.logical_or.reduce(equal)
         | many
         | _at_ends(axes, real)
+        | _keep_a_value(axes, real)
         | _is_odd(output, real)
         | (poses >= RAW_ROWS)
     )
@@ -534,6 +466,13 @@ def _at_ends(axes: Float, real: Bool) -> Bool:
     sizes = np.sort(np.abs(np.concatenate([low, high])), axis=0)
     near = ((sizes[1:] - sizes[:-1]) <= 1.0) & ((sizes[1:] == sizes[:-1]) | (np.fmod(sizes[1:], 1.0) == 0))
     return np.asarray((hits.sum(axis=(0, 2)) > 6) | near.any(axis=0))
+
+
+def _keep_a_value(axes: Float, real: Bool) -> Bool:
+    """Return which sensors have an axis with three equal values in a row in poses that differ: axes (3, R, J)."""
+    same = (axes[..., 1:] == axes[..., :-1]) & real[:, 1:]
+    alone = same & ~same.all(axis=0)
+    return np.asarray((alone[..., 1:] & alone[..., :-1]).any(axis=(0, 2)))
 
 
 def _is_odd(output: Float, real: Bool) -> Bool:

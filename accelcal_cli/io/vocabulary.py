@@ -319,6 +319,16 @@ def describe(name: str) -> Meaning:
     return Meaning(_quantity(rest) or _STEMS.get(rest[-1] if rest else ""), "".join(rest), axis, number)
 
 
+def count_known(names: Sequence[str]) -> int:
+    """Return how many cells of a line are names that are known."""
+    return sum(bool(name) and (is_time(name) or describe(name).is_axis) for name in names)
+
+
+def is_known(names: Sequence[str]) -> bool:
+    """Return whether cells are names of columns, of which some say what they are."""
+    return len(names) > 1 and count_known(names) > 1
+
+
 def _axis_word(words: Sequence[str]) -> tuple[int | None, int | None, int | None]:
     """Return which word tells the axis, and the axis as 0 to 2 or the number that stands for it."""
     for at in reversed(range(len(words))):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -21,7 +22,7 @@ from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
-from accelcal_cli.schema import Checked, setting
+from accelcal_cli.schema import Checked, from_mapping, setting
 
 
 class Status(IntEnum):
@@ -134,6 +135,15 @@ def optimizer_file(name: str) -> Path | None:
     That is `configs/optimizers/<name>.yaml`, or `<name>.yaml` beside the module of an installed optimizer.
     """
     return shipped("optimizers").get(name) or OPTIMIZERS.beside(name, ".yaml")
+
+
+def built(name: str, parameters: Mapping[str, Any]) -> Optimizer[State]:
+    """Return the optimizer of a name with these parameters, and its defaults for the others.
+
+    Raises:
+        ConfigError: unknown optimizer or parameter, or one out of range.
+    """
+    return from_mapping(OPTIMIZERS.get(name), parameters, f"optimizer {name}")
 
 
 def shipped_parameters(optimizer: object) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 
 import numpy as np
 
@@ -153,19 +152,3 @@ def describe(direction: Float) -> str:
         return f"corner between {name[0]}, {name[1]} and {name[2]} up"
     turn = math.degrees(math.atan2(size[2], size[1]))
     return f"{name[0]} up, tilted {tilt:.0f} degrees towards {name[1]} turned {turn:.0f} degrees to {name[2]}"
-
-
-UP_OR_DOWN = re.compile(
-    r"(?<![a-z0-9])(?P<sign>[+-]?)(?P<axis>[xyz])[\s_-]*(?:axis[\s_-]*)?(?P<way>up|down)(?![a-z])",
-    re.IGNORECASE,
-)
-"""What in a label says which way a sensor axis points: "+x up", "-z up", "x_down", "Y axis up"."""
-
-
-def axis_up(label: str) -> tuple[int, int] | None:
-    """Return the axis, 0 to 2, that a label says something of, and 1 if its positive end is up, else -1; or None."""
-    found = UP_OR_DOWN.search(label)
-    if found is None:
-        return None
-    up = 1 if found["way"].lower() == "up" else -1
-    return AXES.index(found["axis"].lower()), -up if found["sign"] == "-" else up

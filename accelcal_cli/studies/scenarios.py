@@ -13,10 +13,18 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.problem import SHIFT, Box, Loetters, half_widths, pack, packed
+from accelcal_cli.calibration.problem import (
+    Box,
+    Loetters,
+    Triangle,
+    compress_each,
+    fit_ellipsoid,
+    pack,
+    packed,
+)
 from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.search import SHIFT, half_widths
 from accelcal_cli.calibration.settings import BoxSettings, Settings
-from accelcal_cli.calibration.triangle import Triangle, compress_each, fit_ellipsoid
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.minimize import polish

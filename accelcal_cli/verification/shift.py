@@ -14,16 +14,15 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.assess import Assessment, assess
-from accelcal_cli.calibration.covariance import NoiseSpread, plain_spread, sandwich, scattered_spread
 from accelcal_cli.calibration.distributions import Noise
 from accelcal_cli.calibration.fit import fit
+from accelcal_cli.calibration.noise import NoiseSpread, directions, plain_spread, sandwich, scattered_spread
 from accelcal_cli.calibration.observability import UNDETERMINED, design
 from accelcal_cli.calibration.residuals import leverages
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import SLOPES, Search, Solution, Stated, reweight, state
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings, Weights
-from accelcal_cli.calibration.weights import directions
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.minimize import polish
 from accelcal_cli.sensor.model import ErrorModel
@@ -228,7 +227,14 @@ class _View:
         if self.stated.noise is None or freedom < 1:
             return spread
         rows, noise, count = design(self.u), self.stated.noise, np.array([freedom])
-        return scattered_spread(spread, rows, self.stated.each_weight(), self.cofactor[None], noise, count)
+        return scattered_spread(
+            spread,
+            rows,
+            self.stated.sample.each_weight(self.stated.weights),
+            self.cofactor[None],
+            noise,
+            count,
+        )
 
     def shift(self, spread: NoiseSpread, value: Float, felt: Float | None, known: Bool, step: Float) -> Shift:
         """Return the shift with the noise that the new readings show, or else that of the result."""
@@ -267,7 +273,7 @@ class _View:
         ratio = 1.0 if old.residual_noise_ratio is None else min(old.residual_noise_ratio, 1.0)
         part = ratio**2 if old.shared_noise == 0 else 1.0
         own: Float = old.shared_noise**2 + part * noise.variance
-        w, rows = self.stated.each_weight(), design(self.u)
+        w, rows = self.stated.sample.each_weight(self.stated.weights), design(self.u)
         room = 1.0 - leverages(rows, w, self.cofactor[None])
         if _counted(self.stated) <= self.basis.shape[1]:
             room = np.ones_like(w)
@@ -276,7 +282,7 @@ class _View:
 
     def _moved_by(self, felt: Float) -> Float:
         """Return what errors of the slopes do to the estimate, shape (9, 6)."""
-        A, w = design(self.u)[0], self.stated.each_weight()[0]
+        A, w = design(self.u)[0], self.stated.sample.each_weight(self.stated.weights)[0]
         return np.asarray(self.cofactor @ (A * w[:, None]).T @ felt)
 
 

@@ -22,9 +22,9 @@ from accelcal_cli.calibration import distributions
 from accelcal_cli.calibration.assess import is_large, large_residuals, not_fitting, ratio_in_words
 from accelcal_cli.calibration.distributions import Noise, Pair
 from accelcal_cli.calibration.observability import PARAMETERS, design, unit
-from accelcal_cli.calibration.residuals import beyond_chance, length_error, leverages, room_of, studentise
+from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.sample import Sample, length_error
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.notices import Notice, are_serious

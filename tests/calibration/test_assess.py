@@ -206,8 +206,10 @@ def test_the_noise_of_forty_clean_sets_is_not_told_of():
     [(1.9, 1e-9, False), (2.1, 1e-9, True), (5.0, 2e-3, False), (5.0, 5e-4, True), (np.nan, np.nan, False)],
 )
 def test_residuals_are_told_of_where_they_are_twice_their_noise_and_surely(ratio, chance, told):
-    said = assess.more_than_noise(ratio, chance)
-    assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
+    for freedom, severity in ((3, "warning"), (4, "note")):
+        said = assess.more_than_noise(ratio, chance, freedom)
+        assert [f"{ratio:.2g} times what the scatter" in line.text for line in said] == [True] * told
+        assert {line.severity for line in said} <= {severity}
 
 
 @pytest.mark.parametrize("part", [0.01, 0.03])
@@ -241,3 +243,19 @@ def test_poses_that_stand_in_for_each_other_are_said_to():
     )
     assert "pose 5" in notice.text
     assert notice.text.endswith("With so few poses one can take the blame of another.")
+
+
+def test_scatter_checks_the_poses_of_a_robust_fit_of_twelve():
+    """Three degrees of freedom and a pose of large leverage: residuals that agree with the scatter bear it out."""
+    u = poses.edges() + 0.14 * noise(12, 1.0, 32)
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    settings = Settings(g=G, optimizer="levenberg-marquardt", robust="huber")
+    output = DPSO.output(G * u + noise(12, 1e-3, 8))
+    alone = calibrate(Readings.from_array(output), settings)
+    assert max(pose.leverage for pose in alone.poses_fit) > 0.9
+    assert alone.verdict == "weak"
+    spread = np.abs(np.diagonal(DPSO.K)) * np.full((12, 3), 1e-2)
+    assert (
+        calibrate(Readings.from_array(output, count=np.full(12, 100), scatter=spread), settings).verdict
+        == "good"
+    )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from simulated import readings
 
-from accelcal_cli.calibration.attitudes import CellCount, distinct
 from accelcal_cli.calibration.calibrate import calibrate
+from accelcal_cli.calibration.observability import CellCount, distinct
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses

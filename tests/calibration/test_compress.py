@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, direct_cost, dpso_box, loetters, noise
 
-from accelcal_cli.calibration.problem import Loetters
-from accelcal_cli.calibration.triangle import Triangle, compress, compress_each, rows
+from accelcal_cli.calibration.problem import Loetters, Triangle, compress, compress_each, quadric_rows
 from accelcal_cli.rng import Streams
 
 G = 9.8
@@ -116,8 +115,10 @@ def test_rows_are_linear_in_the_quadratic_form(seed):
         [q[0, 0], q[1, 1], q[2, 2], q[0, 1], q[0, 2], q[1, 2], q[0, 3], q[1, 3], q[2, 3], q[3, 3]]
     )
     h = np.concatenate([x, np.ones((5, 1))], axis=1)
-    np.testing.assert_allclose(rows(x)[:, :10] @ packed, np.einsum("ji,ik,jk->j", h, q, h), rtol=1e-12)
-    assert (rows(x)[:, 10] == 1.0).all()
+    np.testing.assert_allclose(
+        quadric_rows(x)[:, :10] @ packed, np.einsum("ji,ik,jk->j", h, q, h), rtol=1e-12
+    )
+    assert (quadric_rows(x)[:, 10] == 1.0).all()
 
 
 def test_taking_sensors():

@@ -10,9 +10,9 @@ from scipy import special
 
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.distributions import f_chance
+from accelcal_cli.calibration.noise import _digamma, _inverse_trigamma, _trigamma
 from accelcal_cli.calibration.observability import moved_sensor
 from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.calibration.weights import _digamma, _inverse_trigamma, _trigamma
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, MEMS, noise, rotation
 
-from accelcal_cli.calibration import triangle as triangle_module
+from accelcal_cli.calibration import problem as problem_module
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.problem import half_widths
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid
+from accelcal_cli.calibration.search import half_widths
 from accelcal_cli.calibration.settings import BoxSettings, Settings
-from accelcal_cli.calibration.triangle import compress_each, fit_ellipsoid
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel, misalignment
@@ -163,7 +163,7 @@ def test_alike_axes_have_the_box_and_the_fit_they_always_had(scheme):
     np.testing.assert_array_equal(half[0, 3:6], box.misalignment * scale[0].mean())
     np.testing.assert_array_equal(half[1, 3:6], box.misalignment * scale[1, [1, 2, 2]])
     triangle = compress_each(MEMS.output(G * getattr(poses, scheme)())[None])
-    first = triangle_module._ellipsoid(triangle.R[..., :10])
+    first = problem_module._ellipsoid(triangle.R[..., :10])
     np.testing.assert_array_equal(fit_ellipsoid(triangle)[0], first[0])
 
 

@@ -12,12 +12,12 @@ from simulated import MEMS, noise
 
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
-from accelcal_cli.calibration.fleet import FAILED, calibrate_fleet, standouts
+from accelcal_cli.calibration.fleet import FAILED, calibrate_each, calibrate_fleet, standouts
+from accelcal_cli.calibration.problem import compress_each, fit_ellipsoid, least_squares
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
-from accelcal_cli.calibration.triangle import compress_each, fit_ellipsoid, least_squares
 from accelcal_cli.errors import AccelcalError, ConfigError, DataError
 from accelcal_cli.io.fleet import read_fleet
-from accelcal_cli.io.readings import read_readings
+from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.simulation import Sensor, Spread, draw
@@ -292,6 +292,41 @@ def test_student_and_chi_square_agree_with_scipy():
         np.testing.assert_allclose(student_chance(t, np.full(4, n)), 2.0 * stdtr(n, -t), rtol=1e-6)
         x = n * np.array([0.5, 1.0, 1.5, 2.0])
         np.testing.assert_allclose(chi_square_chance(x, np.full(4, n)), chdtrc(n, x), rtol=1e-9)
+
+
+def each(count=4):
+    """Readings of sensors with counts and scatter, the second with a temperature, and reasons in place of some."""
+    rng = np.random.default_rng(8)
+    made = []
+    for k in range(count):
+        rows = rows_of(np.concatenate([poses.turns(), poses.fibonacci(8 + k)]), k)
+        degrees = np.linspace(5.0, 45.0, len(rows)) if k == 1 else None
+        more = {"count": np.full(len(rows), 50.0), "scatter": rng.uniform(0.5, 1.5, (len(rows), 3))}
+        made.append(Readings.from_array(rows, source=f"S{k}", temperature=degrees, **more))
+    bare = Readings.from_array(rows_of(poses.turns(), 9))
+    return [made[0], "no still pose", made[1], bare, *made[2:]]
+
+
+@pytest.mark.parametrize("robust", ["none", "huber"])
+def test_sensors_one_by_one_are_what_calibrate_makes_of_them(robust):
+    """To the last bit, weights by a shared error and slopes with temperature included; what there is not has failed."""
+    settings, readings = dataclasses.replace(LM, weights="auto", robust=robust), each()
+    kept = {}
+    fleet = calibrate_each(readings, settings, kept.__setitem__)
+    assert fleet.number.tolist() == [0, 1, 2, 3, 4, 5]
+    assert [r for r in range(6) if fleet.verdict[r] == FAILED] == [1, 3]
+    assert fleet.reason[1] == "No still pose."
+    assert fleet.reason[3].startswith("--weights auto needs the number of readings")
+    assert fleet.poses.tolist()[1:4:2] == [0, 24]
+    assert sorted(kept) == [0, 2, 4, 5]
+    for r, record in kept.items():
+        assert record.record() == calibrate(readings[r], settings).record()
+        np.testing.assert_array_equal(fleet.K_a[r], record.K_a)
+        assert (fleet.s[r], fleet.freedom[r]) == (record.s, record.freedom)
+    assert fleet.freedom[2] == fleet.poses[2] - 15
+    assert kept[2].temperature is not None
+    with pytest.raises(ConfigError, match="gauge: full"):
+        calibrate_each(readings, dataclasses.replace(settings, gauge="full"))
 
 
 @pytest.fixture(scope="module")

@@ -246,8 +246,7 @@ def test_sigma_is_missing_where_the_covariance_is():
 
 def test_sigma_of_a_real_fit_is_what_repeated_noise_gives():
     """Propagated sigma against the spread of 400 fits with fresh noise, in every gauge."""
-    from accelcal_cli.calibration.problem import Loetters
-    from accelcal_cli.calibration.triangle import compress_each
+    from accelcal_cli.calibration.problem import Loetters, compress_each
     from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
     from accelcal_cli.optimization.minimize import minimize
     from accelcal_cli.rng import Streams

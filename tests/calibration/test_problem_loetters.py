@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import DPSO, direct_cost, dpso_box, loetters, noise, rotation
 
-from accelcal_cli.calibration.problem import Box, Loetters, pack, unpack
-from accelcal_cli.calibration.triangle import compress_each
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack, unpack
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import to_gauge

@@ -139,3 +139,39 @@ def test_the_slopes_take_their_part_of_the_information():
     np.testing.assert_allclose(result.sigma.K_a, K, rtol=0.04, atol=1e-9)
     plain = calibrate(warm(degrees=degrees, sigma=1e-5), dataclasses.replace(SETTINGS, temperature=False))
     assert D[2] / result.s > 1.5 * plain.sigma.D_a[2] / plain.s
+
+
+def warmed_through(order, drift, seed, span=30.0):
+    """Means of 14 poses, 0.02 mg each, whose temperature rises evenly; a bias drifts with it, by mg in all."""
+    rng = np.random.default_rng(seed)
+    u = poses.directions(14, "fibonacci", np.empty((0, 3)))[order(rng)]
+    t = np.linspace(-0.5, 0.5, 14)
+    force = G * u + np.outer(t, [0.0, 0.0, drift * 1e-3 * G]) + 2e-4 * rng.normal(size=(14, 3))
+    scatter = LOWER.K[0, 0] * 2e-3 * np.sqrt(rng.chisquare(99, (14, 3)) / 99)
+    return Readings.from_array(
+        MEMS.output(force), count=np.full(14, 100), scatter=scatter, temperature=25 + span * t
+    )
+
+
+def drifts(readings_):
+    return [notice for notice in calibrate(readings_, SETTINGS).warnings if notice.key == "drift"]
+
+
+def test_a_temperature_that_goes_with_the_attitude_hides_a_drift():
+    """A spiral from +z to -z while the sensor warms up: the drift of one bias is a scale factor."""
+    (notice,) = drifts(warmed_through(lambda _: np.arange(14), 20.0, 1))
+    assert notice.severity == "warning"
+    assert "would move a parameter" in notice.text
+    assert not drifts(warmed_through(lambda _: np.arange(14), 0.0, 1, span=4.0))
+
+
+def test_a_temperature_that_does_not_go_with_the_attitude_hides_nothing():
+    alarms = sum(
+        bool(drifts(warmed_through(lambda rng: rng.permutation(14), 0.0, seed))) for seed in range(40)
+    )
+    assert alarms <= 4
+
+
+def test_a_drift_that_shows_is_told_of():
+    told = [drifts(warmed_through(lambda rng: rng.permutation(14), 20.0, seed)) for seed in range(20)]
+    assert sum(bool(one) for one in told) >= 17

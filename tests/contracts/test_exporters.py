@@ -39,8 +39,8 @@ def metres():
 
 @pytest.fixture(scope="module")
 def with_slopes(metres):
-    slopes = [np.full(3, 1e-4)] * 6
-    return replace(metres, temperature=Temperature(25.0, 10.0, 40.0, *slopes, np.ones(6)))
+    scale, bias = np.array([4e-4, -3e-4, 2e-4]), np.array([3e-3, -2e-3, 5e-3])
+    return replace(metres, temperature=Temperature(25.0, 12.0, 40.0, scale, bias, *[bias] * 4, np.ones(6)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,6 +62,12 @@ def test_the_round_trip(name, scale, gauge):
     contract.gives_the_force(EXPORTERS.get(name), result(scale, gauge), scale, contract.READERS[name])
 
 
+@pytest.mark.parametrize("name", contract.READERS)
+def test_the_round_trip_at_two_temperatures(name, with_slopes):
+    read = contract.READERS[name]
+    contract.gives_the_force_at_other_temperatures(EXPORTERS.get(name), with_slopes, read)
+
+
 def test_every_format_of_ours_is_read_back():
     ours = {name for name in NAMES if EXPORTERS.get(name).__module__.startswith("accelcal_cli.")}
     assert ours == set(contract.READERS)
@@ -74,7 +80,7 @@ class Bad(Exporter):
     suffix = ".txt"
 
     def content(self, result):
-        return base.comment(base.origin(result)).encode()
+        return base.comment(self.header(result)).encode()
 
 
 class Nameless(Bad):
@@ -139,6 +145,13 @@ class Silent(Bad):
         return ()
 
 
+class SilentFile(Bad):
+    """A format."""
+
+    def content(self, result):
+        return base.comment(base.origin(result)).encode()
+
+
 def test_the_contract_is_kept_by_a_plain_format(metres, with_slopes):
     contract.describes_itself(Bad)
     contract.writes_the_same_bytes(Bad, metres)
@@ -178,11 +191,22 @@ def test_a_class_that_writes_badly_fails(cls, part, reason, metres):
 def test_a_class_that_drops_slopes_silently_fails(with_slopes):
     with pytest.raises(AssertionError, match="nothing tells of the slopes"):
         contract.refuses_or_tells_what_it_cannot_hold(Silent, with_slopes)
+    with pytest.raises(AssertionError, match="the file does not tell of the slopes"):
+        contract.refuses_or_tells_what_it_cannot_hold(SilentFile, with_slopes)
 
 
 def test_a_wrong_sign_fails_the_round_trip(metres):
-    def read(content, reading):
-        return -contract.READERS["ros"](content, reading)
+    def read(content, reading, degrees):
+        return -contract.READERS["ros"](content, reading, degrees)
 
     with pytest.raises(AssertionError):
         contract.gives_the_force(EXPORTERS.get("ros"), metres, 1.0, read)
+
+
+@pytest.mark.parametrize("name", ["px4", "ardupilot", "c-header", "numpy"])
+def test_a_wrong_reference_temperature_fails_the_round_trip(name, with_slopes):
+    def read(content, reading, degrees):
+        return contract.READERS[name](content, reading, None if degrees is None else degrees + 0.5)
+
+    with pytest.raises(AssertionError):
+        contract.gives_the_force_at_other_temperatures(EXPORTERS.get(name), with_slopes, read)

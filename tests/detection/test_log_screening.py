@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from accelcal_cli.detection.detect import DetectSettings, detect
+from accelcal_cli.detection.detect import DetectSettings, TooFewPosesError, detect
 from accelcal_cli.detection.log_screening import alternating
 from accelcal_cli.errors import DataError
 from tests.raw_logs import opened, simulated, text
@@ -89,9 +89,31 @@ def test_a_frozen_axis_is_no_rest(log):
     assert len(found.intervals) == 13
 
 
+def test_steps_near_the_noise_do_not_end_poses():
+    """Of five rows with a noise of 0.8 steps now and then all are equal."""
+    numbers, holds = simulated(14, seed=4, gyro=False, timed=False)
+    still = np.concatenate([numbers[a - 1 : b] - numbers[a - 1 : b].mean(axis=0) for a, b in holds])
+    step = float(still.std()) / 0.8
+    found = detected(step * np.round(numbers / step))
+    assert keys(found) == {}
+    assert len(found.intervals) == 14
+
+
 def test_coarse_readings_are_not_frozen(log):
     rows = 400 * np.round(log[0] / 400)
-    assert keys(detected(rows)) == {}
+    found = keys(detected(rows))
+    assert set(found) == {"quantised"}
+    assert found["quantised"].severity == "note"
+    assert "steps of 400," in found["quantised"].text
+
+
+def test_a_log_with_too_few_poses_says_what_spoils_it(log):
+    """Why poses are missing: the sensor slept through them."""
+    rows, holds = log[0].copy(), log[1]
+    for a, b in holds[:5]:
+        rows[a - 1 : b] = 0.0
+    with pytest.raises(TooFewPosesError, match="rows are zero in all three axes"):
+        detected(rows)
 
 
 @pytest.mark.parametrize("part", [0.9, 0.97])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
 from raw_logs import opened, simulated, text
 
+from accelcal_cli.detection.rawlog import open_raw_log, sensors_of
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.clock import Clock, SoundTimes, unit_of
 from accelcal_cli.io.reader import ReadOptions
@@ -174,8 +176,6 @@ def test_dates_that_go_back_are_named():
 def test_dates_in_parquet(tmp_path):
     import polars
 
-    from accelcal_cli.detection.rawlog import open_raw_log
-
     start = np.datetime64("2026-02-28T23:59:58.500000", "us")
     frame = polars.DataFrame(A, schema=["ax", "ay", "az"]).with_columns(
         polars.Series("time", start + np.round(T[:, 0] * 1e6).astype("timedelta64[us]"))
@@ -219,8 +219,6 @@ def test_a_bad_cell_is_named():
 
 def test_parquet_reads_as_text_does(tmp_path):
     import polars
-
-    from accelcal_cli.detection.rawlog import open_raw_log
 
     path = tmp_path / "log.parquet"
     polars.DataFrame(np.hstack([T, A]), schema=["t", "ax", "ay", "az"]).write_parquet(path)
@@ -308,3 +306,32 @@ def test_single_falls_are_left_out_across_blocks():
         rows = np.concatenate([block.numbers for block in sound.of(blocks)])
         assert sorted(table.out) == sorted(wrong)
         assert [sound.rows.line(k) for k in range(len(rows))] == rows[:, 0].tolist()
+
+
+@pytest.mark.parametrize("large", [False, True], ids=["small", "large"])
+def test_the_sensors_of_a_log_are_the_values_of_a_column(tmp_path, large):
+    """Also of a column of text, of one without a header, and of rows that --where keeps."""
+    rows = [f"{k / 100:.2f},{k % 7},1.5,9.8,{'BA'[k % 2]},{k % 3}\n" for k in range(60_000 if large else 60)]
+    path = tmp_path / "log.csv"
+    path.write_text("t,ax,ay,az,device,slot\n" + "".join(rows))
+    assert sensors_of(path) == (("B", "device=B"), ("A", "device=A"))
+    assert sensors_of(path, "slot") == (("0", "slot=0"), ("1", "slot=1"), ("2", "slot=2"))
+    assert sensors_of(path, options=ReadOptions(where=("device=A",))) == (("A", "device=A"),)
+    with pytest.raises(UsageError, match='no column "nope"'):
+        sensors_of(path, "nope")
+    path.write_text("".join(rows))
+    assert sensors_of(path) == ()
+    assert sensors_of(path, "5") == (("B", "5=B"), ("A", "5=A"))
+
+
+def test_a_name_with_an_equals_sign_is_chosen_by_its_number(tmp_path):
+    columns = {"ax": [1.0, 2.0], "ay": [1.0, 2.0], "az": [1.0, 2.0], "id=": ["p", "q"]}
+    pl.DataFrame(columns).write_parquet(tmp_path / "log.parquet")
+    assert sensors_of(tmp_path / "log.parquet", "id=") == (("p", "4=p"), ("q", "4=q"))
+
+
+def test_a_column_that_counts_is_no_label_of_sensors(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("device,ax,ay,az\n" + "".join(f"{k},1,2,3\n" for k in range(1500)))
+    with pytest.raises(DataError, match='"device" has more than 1,000 values'):
+        sensors_of(path)

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from simulated import MEMS, readings, rotation
 
+from accelcal_cli.calibration.apply import ColumnOptions, Correction
 from accelcal_cli.calibration.calibrate import calibrate
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError, UsageError
@@ -259,6 +260,149 @@ def test_ros_subtracts_the_bias_after_the_matrix(which, request):
     )
 
 
+# Temperature: what `accelcal apply` makes of readings, and what the target of a file does
+
+SCALE_SLOPES, BIAS_SLOPES = np.array([4e-4, -3e-4, 2e-4]), np.array([3e-3, -2e-3, 5e-3])
+
+
+def drifting(factor=1.0, g=G, kelvin=0.0):
+    """A result with slopes, of readings `factor` per m/s^2; with g = 1 they are in units of g."""
+    model = ErrorModel(factor * MEMS.K, factor * MEMS.D * (g / G))
+    u = np.concatenate([poses.turns(), poses.fibonacci(24)])
+    degrees = np.repeat([12.0, 40.0], 24)
+    t = (degrees - 26.0)[:, None]
+    N = (1 + SCALE_SLOPES * t) * (g * u @ model.K.T) + model.D + factor * (g / G) * BIAS_SLOPES * t
+    N += 1e-4 * factor * g * np.random.default_rng(3).standard_normal(N.shape)
+    return calibrate(
+        Readings.from_array(N, temperature=degrees + kelvin),
+        Settings(optimizer="levenberg-marquardt", g=g),
+    )
+
+
+@pytest.fixture(scope="module")
+def warm():
+    return drifting()
+
+
+def applied(found, reading, degrees):
+    """The force of `accelcal apply`, which has the temperature as fourth column."""
+    return Correction(found, ColumnOptions())(np.column_stack([reading, np.full(len(reading), degrees)]))
+
+
+def thermal(name, values, degrees):
+    """What the autopilot subtracts before its offset at a temperature, m/s^2."""
+    if name == "px4":
+        t = np.clip(degrees, values["TC_A0_TMIN"], values["TC_A0_TMAX"]) - values["TC_A0_TREF"]
+        return sum(t**p * np.array([values[f"TC_A0_X{p}_{i}"] for i in range(3)]) for p in range(4))
+
+    def polynomial(temperature):
+        t = np.clip(temperature, values["INS_TCAL1_TMIN"], values["INS_TCAL1_TMAX"]) - 35.0
+        coefficients = [np.array([values[f"INS_TCAL1_ACC{p}_{axis}"] for axis in "XYZ"]) for p in (1, 2, 3)]
+        return 1e-6 * sum(t ** (p + 1) * row for p, row in enumerate(coefficients))
+
+    return polynomial(degrees) - polynomial(values["INS_ACC1_CALTEMP"])
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+@pytest.mark.parametrize("degrees", [14.0, 39.0])
+@pytest.mark.parametrize("kind", ["metres", "in_g", "counts"])
+def test_an_autopilot_follows_the_bias_with_temperature(name, degrees, kind):
+    """Beside the scale slopes, whose size the file tells, it comes to what apply gives at any temperature."""
+    separator, offset, scale = AUTOPILOTS[name]
+    found = drifting(*{"metres": (1.0, G), "in_g": (1.0, 1.0), "counts": (415.0, G)}[kind])
+    options = {"driver_scale": 417.7} if kind == "counts" else {}
+    made = export(found, name, **options)
+    values = parameters(made, separator)
+    drift, still = found.temperature, dataclasses.replace(found.temperature, scale=np.zeros(3))
+    raw = READING * {"metres": 1.0, "in_g": 1 / G, "counts": 415.0}[kind]
+    metres = {"metres": 1.0, "in_g": STANDARD_GRAVITY, "counts": 1 / 417.7}[kind]
+    force = autopilot(values, offset, scale, raw * metres - thermal(name, values, degrees))
+    without = drift.at_reference(raw, np.full(3, degrees), found.D_a)
+    by_bias = still.at_reference(raw, np.full(3, degrees), found.D_a)
+    to_metres = STANDARD_GRAVITY if kind == "in_g" else 1.0
+    np.testing.assert_allclose(force, to_metres * diagonal(found.K_a, found.D_a, by_bias), atol=1e-5)
+    assert np.abs(force - to_metres * diagonal(found.K_a, found.D_a, raw)).max() > 0.02
+    (told,) = (w for w in made.warnings if "slopes of the bias only" in w)
+    bound = float(told.split("up to ")[1].split()[0])
+    left = to_metres * (applied(found, raw, degrees) - found.model.specific_force(by_bias))
+    np.testing.assert_allclose(applied(found, raw, degrees), found.model.specific_force(without), rtol=1e-12)
+    lengths = np.linalg.norm(READING, axis=1) / G
+    assert (np.linalg.norm(left, axis=1) <= 1.05 * bound * lengths).all()
+    assert told in text(made)
+
+
+@pytest.mark.parametrize("name", AUTOPILOTS)
+def test_an_autopilot_measures_in_degrees_celsius(name):
+    made = export(drifting(kelvin=273.0), name)
+    assert "TC_A" not in text(made)
+    assert "TCAL" not in text(made)
+    (told,) = (w for w in made.warnings if "degrees Celsius" in w)
+    assert "the numbers hold at 299 degrees" in told
+    assert told in text(made)
+
+
+def test_thermal_parameters_have_the_number_of_their_instance(warm):
+    assert {"TC_A2_TREF", "CAL_ACC2_XOFF"} <= set(parameters(export(warm, "px4", instance=2), "\t"))
+    second = parameters(export(warm, "ardupilot", instance=1), ",")
+    assert {"INS_TCAL2_ENABLE", "INS_ACC2_CALTEMP", "INS_ACC2OFFS_X"} <= set(second)
+    assert second["INS_ACC2_CALTEMP"] == pytest.approx(26.0)
+
+
+def test_px4_is_told_the_device(warm, metres):
+    nameless, named = export(warm, "px4"), export(warm, "px4", device_id=1310988)
+    assert any("--device-id" in warning for warning in nameless.warnings)
+    assert not any("--device-id" in warning for warning in named.warnings)
+    values = parameters(named, "\t")
+    assert values["CAL_ACC0_ID"] == values["TC_A0_ID"] == 1310988
+    assert "TC_A0_ID\t1310988\t6\n" in text(named)
+    assert "TC_A" not in text(export(metres, "px4", device_id=1310988))
+
+
+def test_a_format_without_slopes_tells_what_is_left(warm):
+    for name in ("kalibr", "ros", "imucal"):
+        (told,) = (w for w in export(warm, name).warnings if "no temperature slopes" in w)
+        assert told in text(export(warm, name))
+        bound = float(told.split("up to ")[1].split()[0])
+        left = applied(warm, READING, 40.0) - warm.model.specific_force(READING)
+        assert np.linalg.norm(left, axis=1).max() <= 1.1 * bound
+
+
+def test_numpy_has_the_slopes(warm, metres):
+    with np.load(io.BytesIO(export(warm, "numpy").content)) as file:
+        t = 40.0 - file["temperature_reference"]
+        plain = (READING - file["D_a"] - file["bias_slope"] * t) / (1 + file["scale_slope"] * t)
+        np.testing.assert_allclose(plain @ file["K_A"].T, applied(warm, READING, 40.0), rtol=1e-12)
+        np.testing.assert_array_equal(file["temperature_range"], [12.0, 40.0])
+        np.testing.assert_array_equal(file["slope_covariance"], warm.temperature.covariance)
+    with np.load(io.BytesIO(export(metres, "numpy").content)) as file:
+        assert "scale_slope" not in file
+
+
+WARM_PROGRAM = """
+#include <stdio.h>
+#include "calibration.h"
+int main(void) {{
+    const double readings[3][3] = {{{rows}}}, degrees[2] = {{14.0, 39.0}};
+    double force[3];
+    for (int k = 0; k < 2; k++) {{
+        for (int j = 0; j < 3; j++) {{
+            accelcal_apply_at(readings[j], degrees[k], force);
+            printf("%.17g %.17g %.17g\\n", force[0], force[1], force[2]);
+        }}
+    }}
+    return 0;
+}}
+"""
+
+
+@pytest.mark.parametrize("language", ["c", "c++"])
+def test_the_c_header_follows_temperature(warm, tmp_path, language):
+    force = compiled(export(warm, "c-header"), WARM_PROGRAM, tmp_path, language)
+    expected = np.concatenate([applied(warm, READING, degrees) for degrees in (14.0, 39.0)])
+    np.testing.assert_allclose(force, expected, rtol=1e-12, atol=1e-12)
+    assert np.abs(expected - np.tile(warm.model.specific_force(READING), (2, 1))).max() > 0.05
+
+
 PROGRAM = """
 #include <stdio.h>
 #include "calibration.h"
@@ -274,19 +418,24 @@ int main(void) {{
 """
 
 
-@pytest.mark.parametrize("language", ["c", "c++"])
-def test_the_c_header_compiles_and_applies(metres, tmp_path, language):
+def compiled(made, program, folder, language):
+    """What a program with the header prints, as numbers, shape (B, 3)."""
     compiler = shutil.which("cc") if language == "c" else shutil.which("c++")
     if compiler is None:
         pytest.skip("no compiler")
-    (tmp_path / "calibration.h").write_bytes(export(metres, "c-header").content)
+    (folder / "calibration.h").write_bytes(made.content)
     rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in READING.tolist())
-    source = tmp_path / f"main.{'c' if language == 'c' else 'cc'}"
-    source.write_text(PROGRAM.format(rows=rows))
+    source = folder / f"main.{'c' if language == 'c' else 'cc'}"
+    source.write_text(program.format(rows=rows))
     flags = ["-Wall", "-Wextra", "-Werror", "-pedantic", *(["-std=c99"] if language == "c" else [])]
-    subprocess.run([compiler, *flags, str(source), "-o", str(tmp_path / "main")], check=True)
-    printed = subprocess.run([tmp_path / "main"], check=True, capture_output=True, text=True).stdout
-    force = np.array([[float(v) for v in line.split()] for line in printed.splitlines()])
+    subprocess.run([compiler, *flags, str(source), "-o", str(folder / "main")], check=True)
+    printed = subprocess.run([folder / "main"], check=True, capture_output=True, text=True).stdout
+    return np.array([[float(v) for v in line.split()] for line in printed.splitlines()])
+
+
+@pytest.mark.parametrize("language", ["c", "c++"])
+def test_the_c_header_compiles_and_applies(metres, tmp_path, language):
+    force = compiled(export(metres, "c-header"), PROGRAM, tmp_path, language)
     np.testing.assert_allclose(force, metres.model.specific_force(READING), rtol=1e-12, atol=1e-12)
     assert '#define ACCELCAL_UNIT "m/s^2"' in text(export(metres, "c-header"))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,14 @@ import numpy as np
 import polars as pl
 import pytest
 
+from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io import parquet
+from accelcal_cli.io.columns import choose
+from accelcal_cli.io.reader import ReadOptions, Selection, TextTable
 from accelcal_cli.io.readings import read_readings
+from accelcal_cli.io.rewrite import Change, rewrite
+from accelcal_cli.io.stream import ByteSource
 
 ROWS = np.random.default_rng(5).normal(size=(1000, 3))
 
@@ -97,3 +103,98 @@ def test_broken_files(tmp_path: Path) -> None:
         path.write_bytes(broken)
         with pytest.raises(DataError, match=r"poses\.parquet: cannot be read as Parquet \(.+\)$"):
             read_readings(path)
+
+
+# Text logs written as Parquet
+
+
+def third(numbers: Float) -> Float:
+    """Return fractions of many digits."""
+    return numbers[:, :3] / 3.0
+
+
+def changed(
+    data: str, path: Path, *, replace: bool = False, blocks: bool = False, **options: Any
+) -> tuple[pl.DataFrame, bytes]:
+    """Return a text log with new columns as Parquet and as text; `blocks` reads it in small ones."""
+    sizes = {"head": 200, "block": 150} if blocks else {}
+
+    def table() -> tuple[TextTable, Change]:
+        source = ByteSource(io.BytesIO(data.encode()), "log.csv", **sizes)
+        table = TextTable(source, ReadOptions(**options))
+        output = choose(table).output
+        return table, Change(Selection(output), third, ("fx", "fy", "fz"), output if replace else ())
+
+    with path.open("wb") as file:
+        parquet.to_parquet(*table(), file)
+    text = io.BytesIO()
+    rewrite(*table(), text)
+    return pl.read_parquet(path), text.getvalue()
+
+
+HEADER = "t,ax,ay,az,remark,n\n"
+BODY = [f"{1_700_000_000_000_000_000 + k},{k}.125,-{k}.5,9.81,note-{k},{k}\n" for k in range(40)]
+LOGS = {
+    "plain": HEADER + "".join(BODY),
+    "no last line end": (HEADER + "".join(BODY)).rstrip("\n"),
+    "carriage returns": (HEADER + "".join(BODY)).replace("\n", "\r\n"),
+    "empty cells": HEADER + "".join(BODY[:20]) + "5,1,2,3,,\n" + "".join(BODY[20:]),
+    "quotes": HEADER + "".join(BODY[:20]) + '5,1,2,3,"a, b",7\n' + "".join(BODY[20:]),
+}
+
+
+@pytest.mark.parametrize("blocks", [False, True], ids=["whole", "blocks"])
+@pytest.mark.parametrize("replace", [False, True], ids=["added", "in place"])
+@pytest.mark.parametrize("name", LOGS)
+def test_text_as_parquet_is_the_text_with_types(
+    tmp_path: Path, name: str, replace: bool, blocks: bool
+) -> None:
+    made, text = changed(LOGS[name], tmp_path / "out.parquet", replace=replace, blocks=blocks)
+    assert made.equals(pl.read_csv(text))
+    assert made.schema["t"] == pl.Int64
+    assert made["t"][0] == 1_700_000_000_000_000_000
+
+
+@pytest.mark.parametrize("blocks", [False, True], ids=["whole", "blocks"])
+def test_a_column_is_what_all_of_its_cells_are(tmp_path: Path, blocks: bool) -> None:
+    header = "ax,ay,az,whole,mixed,late,code,empty,sparse\n"
+    rows = [f"{k},{k}.5,9.8,{k},{k},{k},{k:03d},,\n" for k in range(60)]
+    rows[41] = "1,2,3,-7,4.25,n/a,007,,12\n"
+    made, _ = changed(header + "".join(rows), tmp_path / "out.parquet", blocks=blocks)
+    kinds = {name: made.schema[name] for name in made.columns[:9]}
+    number, text = pl.Float64, pl.String
+    assert list(kinds.values()) == [number, number, number, pl.Int64, number, text, text, text, pl.Int64]
+    assert (made["whole"][41], made["mixed"][41], made["late"][41], made["code"][3]) == (
+        -7,
+        4.25,
+        "n/a",
+        "003",
+    )
+    assert made["empty"].null_count() == 60
+    assert made["sparse"].drop_nulls().to_list() == [12]
+
+
+def test_decimal_commas_are_points_in_parquet(tmp_path: Path) -> None:
+    rows = [f"0,{k};{k},5;{k},25;-9,8;1,{k % 10};x,{k};1.234\n" for k in range(30)]
+    made, _ = changed("t;ax;ay;az;u;s;w\n" + "".join(rows), tmp_path / "out.parquet", blocks=True)
+    assert made.row(7)[:7] == (0.7, 7.5, 7.25, -9.8, 1.7, "x,7", "1.234")
+
+
+def test_lines_that_are_no_rows_are_not_in_parquet(tmp_path: Path) -> None:
+    rows = [f"{k},{k}.5,9.8,{k},# {k}\n" for k in range(60)]
+    rows[30] = "1,bad,2,3,4\n"
+    rows[20:20] = ["ax,ay,az,n,remark\n", "\n", "# a comment\n"]
+    data = "Exported by X\n\nax,ay,az,n,remark\ng,g,g,,\n" + "".join(rows) + "7,8"
+    made, _ = changed(data, tmp_path / "out.parquet", skip_bad=True)
+    assert made.columns == ["ax", "ay", "az", "n", "remark", "fx", "fy", "fz"]
+    assert made["n"].to_list() == [k for k in range(60) if k != 30]
+    with pytest.raises(DataError, match='column "ay": "bad" is not a number'):
+        changed(data, tmp_path / "out.parquet")
+
+
+def test_columns_without_a_name_of_their_own_get_their_numbers(tmp_path: Path) -> None:
+    made, _ = changed("".join(f"{k},{k}.5,9.8\n" for k in range(9)), tmp_path / "out.parquet")
+    assert made.columns == ["1", "2", "3", "fx", "fy", "fz"]
+    data = ",ax,ay,az,s,s\n" + "".join(f"{k},{k}.5,9.8,1,2,3\n" for k in range(9))
+    made, _ = changed(data, tmp_path / "out.parquet")
+    assert made.columns == ["1", "ax", "ay", "az", "s", "s_6", "fx", "fy", "fz"]

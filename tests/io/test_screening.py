@@ -1,10 +1,13 @@
 """What the screening names, in spoiled readings of many sensors, and that it keeps silent over honest ones."""
 
+import io
+
 import numpy as np
 import pytest
 
 from accelcal_cli.io.readings import Readings, read_readings
-from accelcal_cli.io.screening import Screened, grid_step, needs_look
+from accelcal_cli.io.screening import Screened, needs_look
+from accelcal_cli.io.ties import grid_step
 from accelcal_cli.sensor.poses import directions
 from tests.simulated import DPSO, MEMS, readings
 
@@ -180,6 +183,76 @@ def test_frozen_poses_are_told_by_their_scatter():
         rng.uniform(size=(24, 3)) < 0.4, 0.0, scatter
     )  # as of readings coarser than their noise
     assert keys(rows, scatter=coarse, count=count) == set()
+
+
+def stuck(rng, rows):
+    """One axis keeps a reading through a quarter of the rows."""
+    length, out = len(rows) // 4, rows.copy()
+    first, axis = int(rng.integers(1, len(rows) - length)), int(rng.integers(3))
+    out[first : first + length, axis] = rows[first - 1, axis]
+    return out
+
+
+def test_an_axis_that_keeps_its_value_is_named_frozen(capsys):
+    """Where it matters: poses far off the sphere, or a value that noise does not repeat."""
+    rng, named, sets = np.random.default_rng(21), 0, 0
+    for unit in UNITS:
+        for name in ("fibonacci", "random"):
+            for mg in (0.2, 2.0):
+                for _ in range(12):
+                    rows = quantized(output(rng, held(attitudes(name, rng), rng), unit, mg), unit, "text")
+                    named += "frozen" in keys(stuck(rng, rows), severity=None)
+                    sets += 1
+    with capsys.disabled():
+        print(f"\nan axis that keeps its value: named in {named} of {sets}")  # noqa: T201
+    assert named >= 0.9 * sets
+
+
+def table(rows, count):
+    """A table of rows of labelled poses, as text."""
+    lines = [f"p{k // count}," + ",".join(f"{v:.5f}" for v in row) for k, row in enumerate(rows.tolist())]
+    return io.BytesIO("\n".join(["position,ax,ay,az", *lines]).encode())
+
+
+def labelled(rng, name="turns", count=20, mg=2.0, step=None):
+    u = np.repeat(held(attitudes(name, rng), rng), count, axis=0)
+    return quantized(output(rng, u, "m/s^2", mg), "m/s^2", step)
+
+
+def read(rows, count=20):
+    return {notice.key: notice for notice in read_readings("-", stdin=table(rows, count)).warnings}
+
+
+def test_an_axis_without_scatter_in_one_labelled_pose_is_frozen():
+    rng = np.random.default_rng(22)
+    rows = labelled(rng)
+    assert read(rows) == {}
+    rows[100:120, 1] = rows[99, 1]
+    notice = read(rows)["frozen"]
+    assert notice.severity == "warning"
+    assert 'column "ay" repeats one value to the last digit in 1 pose (position "p5")' in notice.text
+
+
+def test_labelled_poses_at_the_end_of_the_range_are_clipped():
+    """Their means are equal to rounding only; one pose alone is told by its scatter."""
+    rng = np.random.default_rng(23)
+    rows = labelled(rng)
+    for part in (0.9, 0.95, 0.98):
+        limit = part * np.abs(rows.reshape(24, 20, 3).mean(axis=1)).max()
+        found = read(np.clip(rows, -limit, limit))
+        assert "clipped" in found
+        assert "frozen" not in found
+
+
+@pytest.mark.parametrize("step", [4.0, 16.0, 32.0])
+def test_coarse_rows_of_labelled_poses_are_neither_frozen_nor_copies(step):
+    """Rows of steps far above their noise: poses without scatter, equal means, equal extremes."""
+    rng = np.random.default_rng(24)
+    for name in ("turns", "edges twice", "fibonacci"):
+        for part in (0.1, 0.6):  # noise in steps
+            found = read(labelled(rng, name, mg=part * step, step=step))
+            assert not [notice for notice in found.values() if notice.severity == "warning"]
+            assert ("quantised" in found) == (part < 0.4)
 
 
 def test_a_log_is_told_from_poses_with_many_rows():

@@ -27,7 +27,7 @@ def complete(shell):
         ("accelcal calibrate data.csv --robust ", ["none", "huber", "soft-l1"]),
         ("accelcal calibrate data.csv --format ", ["table", "json", "csv"]),
         ("accelcal calibrate data.csv --min-p", ["--min-poses"]),
-        ("accelcal fleet data.csv --weights ", ["none", "n", "sd"]),
+        ("accelcal fleet data.csv --weights ", ["none", "n", "sd", "auto"]),
         ("accelcal export result.yaml --to k", ["kalibr"]),
         ("accelcal export result.yaml --dri", ["--driver-scale"]),
         ("accelcal benchmark --func sph", ["sphere"]),

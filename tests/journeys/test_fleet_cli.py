@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -267,3 +268,129 @@ def test_slopes_with_temperature_that_a_file_asks_for_are_refused(run, table):
     assert refused.err.startswith("accelcal: warm.yaml: temperature: true: a fleet goes without")
     Path("cold.yaml").write_text("temperature: false\n")
     assert run("fleet", table, "--config", "cold.yaml").code == 0
+
+
+# Raw logs
+
+
+@pytest.fixture
+def logs(run) -> list[str]:
+    """The names of three raw logs of 14 poses, one sensor each."""
+    names = [f"s{k}.csv" for k in (1, 2, 3)]
+    for seed, name in enumerate(names, start=1):
+        raw = ("--raw", "--sensor", "mems", "--positions", "14", "--rate", "50", "--hold", "3", "--move", "1")
+        made = run("simulate", *raw, "--noise", "0.02", "--seed", str(seed), "-o", name)
+        assert made.code == 0
+    return names
+
+
+def test_each_raw_log_is_a_sensor(run, logs):
+    """Its numbers are those of `calibrate --raw` by itself."""
+    done = run("fleet", "--raw", *logs, "--g", "9.80665", "--format", "json", "-o", "results/")
+    assert (done.code, done.err) == (0, "accelcal: wrote results/\n")
+    rows = json.loads(done.out)
+    assert [(row["sensor"], row["poses"]) for row in rows] == [("s1", 14), ("s2", 14), ("s3", 14)]
+    for name, row in zip(logs, rows, strict=True):
+        alone = ("calibrate", name, "--raw", "--optimizer", "levenberg-marquardt", "--g", "9.80665", "-q")
+        assert run(*alone, "-o", "one.json").code == 0
+        one, kept = (
+            json.loads(Path(file).read_text()) for file in ("one.json", f"results/{row['sensor']}.json")
+        )
+        assert kept == one
+        assert row["K_21"] == one["K_a"][1][0]
+        assert (row["verdict"], one["settings"]["weights"]) == (one["verdict"], "auto")
+
+
+def test_a_broken_or_poor_log_is_a_row_and_not_the_end(run, logs):
+    lines = Path(logs[0]).read_text().splitlines(keepends=True)
+    Path("broken.csv").write_text("".join([*lines[:300], "1,2,x\n", *lines[300:]]))
+    Path("poor.csv").write_text("".join(lines[:700]))
+    in_g = [line.split(",") for line in lines[1:]]
+    cells = [[row[0], *(f"{float(cell) / 16350:.6f}" for cell in row[1:])] for row in in_g]
+    Path("in_g.csv").write_text("t,ax [g],ay [g],az [g]\n" + "".join(",".join(row) + "\n" for row in cells))
+    files = ("in_g.csv", "broken.csv", logs[0], "poor.csv", "gone.csv", logs[1])
+    done = run("fleet", "--raw", *files, "--format", "json")
+    assert done.code == 1
+    rows = {row["sensor"]: row for row in json.loads(done.out)}
+    assert [(name, row["verdict"]) for name, row in rows.items()] == [
+        ("in_g", "failed"), ("broken", "failed"), ("s1", "good"), ("poor", "failed"), ("gone", "failed"),
+        ("s2", "good"),
+    ]  # fmt: skip
+    assert rows["broken"]["reason"].startswith("Line 301: has 3 cells")
+    assert "fewer than 12" in rows["poor"]["reason"]
+    assert rows["gone"]["reason"].startswith("No such file")
+    assert rows["in_g"]["reason"].startswith("1 g is 1 in the unit of its readings, and 9.80665 in that")
+    assert "4 of 6 sensors undetermined or failed: in_g, broken, poor, gone" in done.err
+    mended = run("fleet", "--raw", "broken.csv", logs[1], "--skip-bad", "--format", "json")
+    assert [row["verdict"] for row in json.loads(mended.out)] == ["good", "good"]
+    assert "1 broken row left out (--skip-bad): line 301 (1 of 2 logs)" in mended.err
+
+
+def test_the_values_of_a_column_are_the_sensors_of_a_log(run, logs):
+    """Rows of two sensors in turn; the column is found by its name, or stated."""
+    rows = [Path(name).read_text().splitlines() for name in logs[:2]]
+    in_turn = zip_longest(
+        *([f"{row},{label}\n" for row in table[1:]] for table, label in zip(rows, "AB", strict=True))
+    )
+    both = [row for pair in in_turn for row in pair if row]
+    alone = json.loads(run("fleet", "--raw", *logs[:2], "--format", "json", "-q").out)
+    for name, column in (("device", ()), ("unit_of_test", ("--sensor-column", "unit_of_test"))):
+        Path("both.csv").write_text(f"{rows[0][0]},{name}\n" + "".join(both))
+        done = run("fleet", "--raw", "both.csv", *column, "--format", "json", "-q")
+        found = json.loads(done.out)
+        assert [row["sensor"] for row in found] == ["A", "B"]
+        assert [row["poses"] for row in found] == [14, 14]
+        for one, other in zip(found, alone, strict=True):
+            assert {**one, "sensor": ""} == {**other, "sensor": ""}
+    one = run("fleet", "--raw", "both.csv", "--where", "unit_of_test=B", "--format", "json", "-q")
+    assert [row["sensor"] for row in json.loads(one.out)] == ["both"]
+    two = run("fleet", "--raw", "both.csv", logs[2], "--sensor-column", "5", "--format", "json", "-q")
+    assert [row["sensor"] for row in json.loads(two.out)] == ["both/A", "both/B", "s3"]
+    assert json.loads(two.out)[2]["verdict"] == "failed"
+
+
+def test_a_raw_log_from_standard_input(run, logs):
+    text = Path(logs[0]).read_bytes()
+    assert run("fleet", "--raw", "-", "-q", stdin=text).out.startswith("1 sensor: 1 good\n")
+    refused = run("fleet", "--raw", "-", "--sensor-column", "device", stdin=text)
+    assert (refused.code, "standard input is read once" in refused.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("--rate", "50"), "--rate needs --raw"),
+        (("--raw", "--merge", "1", "--thin", "2"), "--merge and --thin: expected one of them"),
+        (("--raw", "--columns", "a,b,c"), 'no column "a" in s1.csv'),
+        (("--raw", "--gauge", "full"), "gauge: full: a fleet goes with"),
+        (("--weights", "auto"), "weights: auto: a fleet goes with none, n, sd only"),
+    ],
+)
+def test_what_does_not_go_with_logs_is_refused(run, logs, arguments, part):
+    done = run("fleet", *logs, *arguments)
+    assert (done.code, done.out) == (2, "")
+    assert part in done.err
+
+
+def test_a_raw_log_twice_is_refused(run, logs):
+    done = run("fleet", "--raw", logs[0], logs[0])
+    assert (done.code, done.err) == (2, "accelcal: s1.csv: is given twice\n")
+
+
+def test_slopes_and_robust_losses_go_with_raw_logs(run, logs):
+    """A sensor that drifts is calibrated as by itself, slopes with temperature and all."""
+    made = ("--raw", "--sensor", "mems", "--positions", "24", "--rate", "50", "--hold", "3", "--move", "1")
+    assert run("simulate", *made, "--noise", "0.02", "-o", "long.csv").code == 0
+    rows = np.loadtxt("long.csv", delimiter=",", skiprows=1)
+    degrees = np.linspace(10.0, 40.0, len(rows))
+    rows[:, 1:4] += 3.0 * (degrees - 25.0)[:, None]
+    table = np.column_stack([rows, degrees])
+    np.savetxt("warm.csv", table, delimiter=",", header="t,ax,ay,az,temperature", comments="", fmt="%.9g")
+    Path("robust.yaml").write_text("robust: huber\ntemperature: true\n")
+    done = run("fleet", "--raw", "warm.csv", logs[1], "--config", "robust.yaml", "-o", "results/", "-q")
+    assert done.code == 0, done.out
+    warm = load_result("results/warm.json")
+    assert (warm.settings["robust"], warm.freedom) == ("huber", warm.poses - 15)
+    assert (np.abs(warm.temperature.bias - 3.0) < 4.5 * warm.temperature.sigma_bias).all()
+    assert warm.temperature.sigma_bias.max() < 0.5
+    assert load_result("results/s2.json").temperature is None

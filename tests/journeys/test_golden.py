@@ -151,6 +151,9 @@ CASES = {
         export good.yaml --to numpy -o good.npz
         export faces.yaml --to ros
         export warm.yaml --to ros
+        export warm.yaml --to px4 --driver-scale 1670 --device-id 1310988
+        export warm.yaml --to ardupilot --driver-scale 1670
+        export warm.yaml --to c-header
         export good.yaml --to nonsense
     """,
     "apply": """

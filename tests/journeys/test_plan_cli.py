@@ -112,6 +112,36 @@ def test_a_record_through_a_pipe_that_is_none_of_a_calibration_is_refused(run):
     assert done.err.startswith("accelcal: <stdin>: schema is 'accelcal/verification/1'; expected")
 
 
+def test_the_poses_so_far_may_come_from_a_raw_log(run, tmp_path):
+    """Those that detect finds; without --min-poses also fewer than a calibration needs."""
+    raw = ("--raw", "--sensor", "mems", "--rate", "50", "--hold", "3", "--move", "1", "--noise", "0.02")
+    for positions in ("14", "6"):
+        made = run("simulate", *raw, "--positions", positions, "-o", f"{positions}.csv")
+        assert made.code == 0
+    assert run("detect", "14.csv", "-o", "poses.csv").code == 0
+    plain = json.loads(run("plan", "poses.csv", "--format", "json").out)
+    many = run("plan", "14.csv", "--raw", "--format", "json")
+    found = json.loads(many.out)
+    assert (many.code, found["so_far"]["verdict"]) == (0, "good")
+    assert found["poses"][0]["pose"] == plain["poses"][0]["pose"] == 14
+    for name, value in plain["poses"][0].items():
+        assert (
+            value is None
+            or isinstance(value, str)
+            or found["poses"][0][name] == pytest.approx(value, rel=0.1)
+        )
+    few = run("plan", "6.csv", "--raw", "--add", "6", "--format", "json")
+    record = json.loads(few.out)
+    assert (few.code, record["so_far"]["verdict"], record["verdict"]) == (0, "undetermined", "good")
+    assert [pose["pose"] for pose in record["poses"]] == list(range(6, 13))
+    piped = run(
+        "plan", "-", "--raw", "--add", "6", "--format", "json", stdin=(tmp_path / "6.csv").read_bytes()
+    )
+    assert json.loads(piped.out)["poses"] == record["poses"]
+    refused = run("plan", "6.csv", "--raw", "--min-poses", "7")
+    assert (refused.code, "6 still poses in 6 attitudes, fewer than 7" in refused.err) == (2, True)
+
+
 def test_the_table_says_how_to_hold_the_sensor(run):
     done = run("plan", "--poses", "12", "--fixture", "edges", "--noise", "0.01")
     assert done.code == 0
@@ -142,6 +172,10 @@ def test_faces_alone_exit_with_1(run):
         (("six.csv", "--columns", "a,b,c"), "six.csv"),
         (("r.yaml", "--g", "9.8"), "leave out --columns, --where, --g and --latitude"),
         (("bad.yaml",), "bad.yaml"),
+        (("r.yaml", "--raw"), "r.yaml: a result file is no log; leave out --raw"),
+        (("--raw",), "--raw needs the name of a log"),
+        (("six.csv", "--rate", "50"), "--rate needs --raw"),
+        (("six.csv", "--raw"), "six.csv"),
         (("--format", "xml"), '--format "xml": unknown'),
     ],
 )

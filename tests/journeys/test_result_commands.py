@@ -192,6 +192,50 @@ def test_parquet_stays_parquet(run, result, log):
     assert pl.read_csv("again.csv").equals(pl.read_csv("out.csv"))
 
 
+def test_text_becomes_parquet(run, result, log):
+    """Of the same columns as the text, from a file and from a pipe, and with the options of text."""
+    assert run("apply", result, log, "--tilt", "-o", "out.csv").code == 0
+    outcome = run("apply", result, log, "--tilt", "-o", "out.parquet")
+    assert (outcome.code, outcome.err) == (0, "accelcal: wrote out.parquet\n")
+    made = pl.read_parquet("out.parquet")
+    assert made.equals(pl.read_csv("out.csv"))
+    assert run("apply", result, "-", "--tilt", "-o", "pipe.pq", stdin=Path(log).read_bytes()).code == 0
+    assert pl.read_parquet("pipe.pq").equals(made)
+    lines = Path(log).read_text().splitlines(keepends=True)
+    Path("bad.csv").write_text("".join(["no table\n", *lines[:9], "1,x,2,3,y\n", *lines[9:]]))
+    outcome = run("apply", result, "bad.csv", "-o", "bad.parquet")
+    assert (outcome.code, "bad.csv, line 11" in outcome.err, Path("bad.parquet").exists()) == (2, True, False)
+    options = ("--skip-bad", "--skip-rows", "1", "--count", "none", "--tilt")
+    outcome = run("apply", result, "bad.csv", *options, "-o", "bad.parquet")
+    assert (outcome.code, "1 broken row left out (--skip-bad): line 11" in outcome.err) == (0, True)
+    assert pl.read_parquet("bad.parquet").equals(made)
+    assert "line 11" in run("apply", result, "bad.csv", *options, "-o", "bad.csv").err
+
+
+def test_a_slower_temperature_is_carried_on(run, tmp_path):
+    """An empty cell has the last temperature above it; before the first there is none to take."""
+    assert run("simulate", "--sensor", "mems", "--positions", "24", "-o", "u.csv", "-q").code == 0
+    degrees = np.tile([10.0, 40.0], 24)
+    rows = np.repeat(np.loadtxt("u.csv", delimiter=",", skiprows=1), 2, axis=0) + 0.5 * degrees[:, None]
+    cells = [",".join(map(repr, row)) for row in rows.tolist()]
+    header = "Nx,Ny,Nz,temperature\n"
+    full = [f"{row},{t}\n" for row, t in zip(cells, degrees.tolist(), strict=True)]
+    Path("warm.csv").write_text(header + "".join(full))
+    assert run("calibrate", "warm.csv", "--g", G, "-o", "warm.yaml", "-q").code == 0
+    Path("same.csv").write_text(
+        header + "".join(f"{row},{10.0 + 30.0 * (k // 4 % 2)}\n" for k, row in enumerate(cells))
+    )
+    slow = [f"{row},{10.0 + 30.0 * (k // 4 % 2) if k % 4 == 0 else ''}\n" for k, row in enumerate(cells)]
+    Path("slow.csv").write_text(header + "".join(slow))
+    force_of = {name: run("apply", "warm.yaml", name).out for name in ("same.csv", "slow.csv")}
+    same, sparse = (
+        np.genfromtxt(io.StringIO(text), delimiter=",", skip_header=1) for text in force_of.values()
+    )
+    np.testing.assert_array_equal(same[:, 4:], sparse[:, 4:])
+    Path("late.csv").write_text(header + "".join(slow[1:]))
+    assert 'line 2, column "temperature"' in run("apply", "warm.yaml", "late.csv").err
+
+
 def test_a_log_may_be_replaced_by_its_result(run, result, log):
     before = Path(log).read_text()
     assert run("apply", result, log, "-o", log, "-q").code == 0
@@ -242,8 +286,11 @@ def test_a_temperature_column_is_used(run, tmp_path):
     assert outcome.err == ""
     np.savetxt("cold.csv", rows, delimiter=",", header="Nx,Ny,Nz", comments="")
     assert "no temperature column" in run("apply", "warm.yaml", "cold.csv").err
-    warned = run("export", "warm.yaml", "--to", "c-header")
-    assert "temperature slopes are dropped" in warned.err
+    whole = run("export", "warm.yaml", "--to", "c-header")
+    assert ("accelcal_apply_at" in whole.out, whole.err) == (True, "")
+    warned = run("export", "warm.yaml", "--to", "ros")
+    assert "no temperature slopes" in warned.err
+    assert "no temperature slopes" in warned.out
 
 
 def test_known_attitudes_on_the_command_line(run):
@@ -328,7 +375,6 @@ APPLY = {
     "prefix": (["result.yaml", "log.csv", "--prefix", "f,"], ['--prefix "f,"', "letters"]),
     "unit": (["result.yaml", "log.csv", "--unit", "gs"], ['--unit "gs"', 'did you mean "g"', "m/s^2"]),
     "noise": (["result.yaml", "log.csv", "--noise", "nan"], ["--noise nan", "zero or more"]),
-    "text as Parquet": (["result.yaml", "log.csv", "-o", "out.parquet"], ["out.parquet", "log.csv is text"]),
     "no folder": (["result.yaml", "log.csv", "-o", "no/out.csv"], ["no/out.csv", "no such folder"]),
     "a folder": (["result.yaml", "log.csv", "-o", "folder"], ["folder", "is a directory"]),
     "tilt in gauge full": (["full.yaml", "log.csv", "--tilt"], ["--tilt", "gauge full"]),
@@ -466,6 +512,17 @@ def test_a_full_disk_is_one_message_and_no_file(run, result, long_log, log, tmp_
         refused(outcome, ["out.csv", "cannot be written", os.strerror(errno.EFBIG).lower()])
         assert sorted(os.listdir(tmp_path)) == before
         assert Path("out.csv").read_text() == "the old one"
+
+
+def test_no_room_for_the_copy_of_a_text_is_one_message(run, result, long_log, tmp_path):
+    before, limit = sorted(os.listdir(tmp_path)), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limit[1]))
+    try:
+        outcome = run("apply", result, long_log, "-o", "out.parquet")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    refused(outcome, ["long.csv", "no room for a working copy"])
+    assert sorted(os.listdir(tmp_path)) == before
 
 
 @pytest.mark.parametrize("name", ["long.csv", "log.csv", "long.parquet"])

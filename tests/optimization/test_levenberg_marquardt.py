@@ -8,8 +8,7 @@ from known_problems import Decay, Watched
 from scipy.optimize import least_squares
 from simulated import DPSO, MEMS, dpso_box, loetters, noise
 
-from accelcal_cli.calibration.problem import Box, Loetters, pack
-from accelcal_cli.calibration.triangle import compress_each
+from accelcal_cli.calibration.problem import Box, Loetters, compress_each, pack
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimization.minimize import minimize
 from accelcal_cli.optimization.optimizer import Status
