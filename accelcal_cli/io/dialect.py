@@ -21,8 +21,8 @@ from accelcal_cli.io.stream import LONGEST_LINE
 from accelcal_cli.io.vocabulary import (
     LAYOUTS,
     Facts,
-    describe,
-    is_time,
+    count_known,
+    is_known,
     is_unit_row,
     parse_unit,
     read_facts,
@@ -239,7 +239,7 @@ def sniff(head: bytes, source: str, skip: int = 0) -> Dialect:
     if not lines:
         raise DataError(f"{source}: is empty; readings were expected, one row per pose")
     texts = [text for _, text in lines]
-    dense = _dense(texts[1:] or texts)[-SAMPLED:]
+    dense = _dense((texts[1:] or texts)[-4 * SAMPLED :])[-SAMPLED:]
     separator = _separator(dense)
     if separator == " " and _names_tabs(texts, dense):
         separator = "\t"
@@ -559,7 +559,7 @@ def _with_header(
     titles = [k for k in block if k not in units]
     if not titles:  # the names stand in a comment
         return Layout(first, units=tuple(block[max(units)]))
-    header = max(titles, key=lambda k: (_score(block[k]), k))
+    header = max(titles, key=lambda k: (count_known(block[k]), k))
     below = next((tuple(block[k]) for k in units if k > header and any(map(_says, block[k]))), None)
     names = _grouped(block.get(header - 1) if header - 1 in titles else None, block[header])
     return Layout(first, tuple(names[:-1] if _ends_in_remark(names, width) else names), header, below)
@@ -581,16 +581,6 @@ def _ends_in_remark(names: Sequence[str], width: int) -> bool:
 
 def _says(unit: str) -> bool:
     return parse_unit(unit) not in (None, "-")
-
-
-def _score(names: Sequence[str]) -> int:
-    """Return how many cells of a line are names that are known."""
-    return sum(bool(name) and (is_time(name) or describe(name).is_axis) for name in names)
-
-
-def is_known(names: Sequence[str]) -> bool:
-    """Return whether cells are names of columns, of which some say what they are."""
-    return len(names) > 1 and _score(names) > 1
 
 
 def _grouped(groups: Sequence[str] | None, names: Sequence[str]) -> Sequence[str]:

@@ -12,6 +12,7 @@ import math
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
@@ -234,19 +235,23 @@ class TextTable:
 
     def preview(self) -> list[list[str]]:
         """Return the cells of some rows of the head that are read, spread over it."""
-        head = self._source.head if self._words is None else self._words.translate(self._source.head)
-        lines = head.splitlines()[self.dialect.top :]
-        if self._words is not None:
-            lines = [line for line in lines if line]
-        step = max(1, len(lines) // (2 * SAMPLE)) if len(lines) > 2 * SAMPLE else 1
-        texts = [line.decode(errors="replace") for line in lines[::step]]
-        rows = (
-            split_cells(text, self.dialect.separator)
-            for text in texts
-            if not is_comment(text, self.dialect.marks)
-        )
-        whole = (cells for cells in rows if len(cells) >= self.dialect.width)
+        lines = [text for text in self._sample if not is_comment(text, self.dialect.marks)]
+        rows = [split_cells(text, self.dialect.separator) for text in lines]
+        whole = [cells for cells in rows if len(cells) >= self.dialect.width]
         return [cells for cells in whole if self.filter is None or self.filter.meets(cells)]
+
+    @cached_property
+    def _sample(self) -> list[str]:
+        """Lines spread over the head."""
+        head = self._source.head if self._words is None else self._words.translate(self._source.head)
+        ends = np.flatnonzero(np.frombuffer(head, np.uint8) == ord("\n"))
+        starts = np.append(0, ends + 1)[self.dialect.top :]
+        ends = np.append(ends, len(head))[self.dialect.top :]
+        filled = ends > starts
+        starts, ends = starts[filled], ends[filled]
+        step = max(1, len(starts) // SAMPLE)
+        pairs = zip(starts[::step].tolist(), ends[::step].tolist(), strict=True)
+        return [head[start:end].decode(errors="replace").rstrip("\r") for start, end in pairs]
 
     def keep_only(self, rows: RowFilter) -> None:
         """Read only those rows, which may hold numbers where the first row of the table holds none."""

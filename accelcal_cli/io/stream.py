@@ -9,24 +9,24 @@ the interpreter lock to a `BackgroundThread`.
 from __future__ import annotations
 
 import codecs
-import gzip
 import hashlib
 import os
 import sys
 import weakref
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
-from typing import BinaryIO, Protocol
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, did_you_mean
+
+if TYPE_CHECKING:
+    from zipfile import ZipFile
 
 HEAD = 4 << 20
 """Bytes of the first block: an input up to this size is one block and never needs polars."""
@@ -41,7 +41,7 @@ IN_MEMORY = 1_000_000
 """Rows of a store that stay in memory."""
 
 PEEKED = 1 << 16
-"""Bytes of a packed input that are looked at."""
+"""Bytes that show how an input is packed or encoded."""
 
 LAYERS = 3
 """Packings one within another that are undone, as of UTF-16 text in a zip archive."""
@@ -272,7 +272,7 @@ def _encoding(head: bytes) -> tuple[str, str] | None:
     """Return name and codec of an encoding other than UTF-8, None for UTF-8 and for what is no text."""
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "UTF-16", "utf-16"
-    pairs = head[: len(head) // 2 * 2]
+    pairs = head[: min(len(head), PEEKED) // 2 * 2]
     even, odd = pairs[::2], pairs[1::2]
     if len(even) > 2 and odd.count(0) > 0.9 * len(odd) and not even.count(0):
         return "UTF-16", "utf-16-le"
@@ -323,10 +323,14 @@ class _Gunzipped:
     """The bytes of a gzip file."""
 
     def __init__(self, stream: ByteReader, name: str) -> None:
+        import gzip  # like zipfile it takes longer to import than a small table to read
+
         self.name = name
         self.file = gzip.GzipFile(fileobj=stream)  # type: ignore[call-overload]
 
     def read(self, size: int = -1, /) -> bytes:
+        import zlib
+
         try:
             data: bytes = self.file.read(size)
         except (EOFError, OSError, zlib.error) as problem:
@@ -367,6 +371,7 @@ class _Member:
     def __init__(self, stream: ByteReader, name: str) -> None:
         import shutil
         import tempfile
+        import zipfile
 
         self.name = name
         self.copy = tempfile.TemporaryFile(prefix="accelcal-")  # noqa: SIM115
@@ -385,6 +390,9 @@ class _Member:
             raise
 
     def read(self, size: int = -1, /) -> bytes:
+        import zipfile
+        import zlib
+
         try:
             return self.file.read(size)
         except (zipfile.BadZipFile, EOFError, zlib.error) as problem:
@@ -395,7 +403,7 @@ class _Member:
         self.copy.close()
 
 
-def _only_file(archive: zipfile.ZipFile, name: str) -> str:
+def _only_file(archive: ZipFile, name: str) -> str:
     """Return the name of the one file in an archive."""
     names = [entry.filename for entry in archive.infolist() if not entry.is_dir()]
     files = [member for member in names if not member.startswith("__MACOSX/") and "/." not in f"/{member}"]

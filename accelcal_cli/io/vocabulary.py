@@ -172,18 +172,15 @@ _ALONE = {
 _TIME = re.compile(r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?")
 _SENSOR_PERHAPS = re.compile(r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer")
 
-_RATE = re.compile(r"(\d+(?:\.\d+)?)\s*hz\b", re.IGNORECASE)
-_RATE_NAMED = re.compile(
+_RATE = r"(\d+(?:\.\d+)?)\s*hz\b"  # compiled where there is something above a table
+_RATE_NAMED = (
     r"(?:sampl\w*[ _-]?(?:rate|freq\w*)|update rate|data rate|measurement frequency|abtastrate|frequency)"
-    r"\W+(\d+(?:\.\d+)?)",
-    re.IGNORECASE,
+    r"\W+(\d+(?:\.\d+)?)"
 )
-_SERIAL = re.compile(
-    r"(?:serial(?:[ _-]?(?:number|code|no|nr))?|device[ _]?id|seriennummer)\W+(\w[\w-]*)", re.IGNORECASE
-)
-_START = re.compile(r"start(?:[ _-]?(?:time|date))?\W+(\d[\d/.:T -]*\d)", re.IGNORECASE)
-_RANGE = re.compile(r"range\W+([^,;\t]*?\d+\s*g)\b", re.IGNORECASE)
-_ORDER = re.compile(r"\b(d{1,2}[/.-]m{1,2}|m{1,2}[/.-]d{1,2})[/.-]y{2,4}", re.IGNORECASE)
+_SERIAL = r"(?:serial(?:[ _-]?(?:number|code|no|nr))?|device[ _]?id|seriennummer)\W+(\w[\w-]*)"
+_START = r"start(?:[ _-]?(?:time|date))?\W+(\d[\d/.:T -]*\d)"
+_RANGE = r"range\W+([^,;\t]*?\d+\s*g)\b"
+_ORDER = r"\b(d{1,2}[/.-]m{1,2}|m{1,2}[/.-]d{1,2})[/.-]y{2,4}"
 
 LAYOUTS: dict[tuple[str, int], tuple[str, ...]] = {
     ("GENEActiv", 7): ("time", "x [g]", "y [g]", "z [g]", "light [lux]", "button", "temperature [degC]"),
@@ -320,6 +317,16 @@ def describe(name: str) -> Meaning:
     )
     rest = [*words[:at], *([stem] if stem else []), *words[at + 1 :]]
     return Meaning(_quantity(rest) or _STEMS.get(rest[-1] if rest else ""), "".join(rest), axis, number)
+
+
+def count_known(names: Sequence[str]) -> int:
+    """Return how many cells of a line are names that are known."""
+    return sum(bool(name) and (is_time(name) or describe(name).is_axis) for name in names)
+
+
+def is_known(names: Sequence[str]) -> bool:
+    """Return whether cells are names of columns, of which some say what they are."""
+    return len(names) > 1 and count_known(names) > 1
 
 
 def _axis_word(words: Sequence[str]) -> tuple[int | None, int | None, int | None]:
@@ -529,9 +536,14 @@ class Facts:
 
 def read_facts(lines: Sequence[str]) -> Facts:
     """Return what the lines above a table say."""
+    if not lines:
+        return Facts()
     text = "\n".join(lines)
-    rate = _RATE_NAMED.search(text) or _RATE.search(text)
-    start, serial, span, order = (pattern.search(text) for pattern in (_START, _SERIAL, _RANGE, _ORDER))
+    named, rate, start, serial, span, order = (
+        re.search(pattern, text, re.IGNORECASE)
+        for pattern in (_RATE_NAMED, _RATE, _START, _SERIAL, _RANGE, _ORDER)
+    )
+    rate = named or rate
     return Facts(
         float(rate[1]) if rate and float(rate[1]) > 0 else None,
         start[1].strip() if start else "",
