@@ -207,11 +207,14 @@ def bend_and_drift(residuals: PoseResiduals, poses: Int, g: float) -> tuple[Floa
     spare = np.count_nonzero(residuals.weight, axis=1) - 9 - 3
     if spare.max() < FEWEST_SPARE:
         return np.full(len(spare), np.nan), np.full(len(spare), np.nan)
-    e, rows, cofactor = _linearised(residuals.force, residuals.weight, g, np.arange(9))
-    u = unit(residuals.force)
+    f, w = residuals.force, residuals.weight
+    # Unit directions in the nine as in the patterns: with the length of f in one of them alone, noise is a pattern.
+    u, e = unit(f), (g * g - np.sum(f * f, axis=2)) / (2.0 * g)
+    rows = design(u)
+    cofactor = _cofactor((rows * w[..., None]).swapaxes(1, 2) @ rows)
     time = (residuals.pose / np.maximum(poses[:, None] - 1, 1))[..., None]
     kinds = (u**3, u**4, np.concatenate([u**3, u**4], axis=2), time * u)
-    *bends, drift = (pattern_chance(e, rows, residuals.weight, cofactor, columns, g) for columns in kinds)
+    *bends, drift = (pattern_chance(e, rows, w, cofactor, columns, g) for columns in kinds)
     return np.minimum(len(bends) * np.fmin.reduce(bends), 1.0), drift  # Bonferroni
 
 
@@ -304,15 +307,17 @@ def _linearised(force: Float, weights: Float, g: float, free: Int) -> tuple[Floa
     """
     e = (g * g - np.sum(force * force, axis=2)) / (2.0 * g)
     rows = design(force / g)[..., free]
-    normal = (rows * weights[..., None]).swapaxes(1, 2) @ rows
-    size = np.einsum("spp->s", normal)
+    return e, rows, _cofactor((rows * weights[..., None]).swapaxes(1, 2) @ rows)
+
+
+def _cofactor(normal: Float) -> Float:
+    """Return the inverses of normal matrices, shape (S, p, p), NaN where they are singular."""
+    size, one = np.einsum("spp->s", normal), np.eye(normal.shape[1])
     finite = np.isfinite(size)[:, None, None]
-    inverse = np.linalg.inv(
-        np.where(finite, normal + RIDGE * size[:, None, None] * np.eye(len(free)), np.eye(len(free)))
-    )
+    inverse = np.linalg.inv(np.where(finite, normal + RIDGE * size[:, None, None] * one, one))
     spread = np.einsum("spp->s", inverse) * size
     known = (spread > 0) & (spread < 1.0 / LEAST_ROOM)
-    return e, rows, np.where(known[:, None, None], inverse, np.nan)
+    return np.where(known[:, None, None], inverse, np.nan)
 
 
 def _moved(force: Float, step: Float, g: float) -> Float:

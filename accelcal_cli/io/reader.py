@@ -121,7 +121,7 @@ class InputTable(Protocol):
 
     @property
     def source_format(self) -> str:
-        """How the input is written, as ``text, comma, gzip`` or ``parquet``."""
+        """How the input is written: ``csv``, whatever separates its columns, or ``parquet``."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -205,13 +205,7 @@ class TextTable:
         """SHA-256 of the bytes read so far."""
         return self._source.sha256
 
-    @property
-    def source_format(self) -> str:
-        """How the text is written."""
-        form = SEPARATORS[self.dialect.separator] if self._words is None else self._words.form
-        return ", ".join(
-            ["text", form, *(["decimal comma"] * self.dialect.decimal_comma), *self._source.forms]
-        )
+    source_format = "csv"
 
     @property
     def rows_skipped(self) -> int:

@@ -42,7 +42,7 @@ class InputForm:
     """How an input is written.
 
     Attributes:
-        source_format: ``text, comma``, ``parquet``, ``array``, ...
+        source_format: ``csv``, ``parquet``, ``array``, ...
         rows: read, without those skipped; rows_skipped: broken ones left out.
         rate_hz: rows per second of a log, None where it is unknown.
         unit: of the readings as the file states it: g, mg, m/s^2 or counts; None where it does not.

@@ -127,7 +127,7 @@ def test_the_exporter_keeps_the_contract(site):
 
 
 def test_an_exporter_without_its_origin_breaks_the_contract(altered):
-    bare = altered("[*origin(result), ", "[", module="text.py")
+    bare = altered("[*self.header(result), ", "[", module="text.py")
     done = contract(bare, "test_the_contract and text", "exporters")
     assert (done.returncode, "AssertionError: no " in done.stdout) == (1, True), done.stdout
 

@@ -67,7 +67,7 @@ def test_columns_units_and_temperature_are_those_of_the_message(end: str) -> Non
     assert source.columns.names == ("AccX", "AccY", "AccZ")
     assert source.gyro_names() == ("GyrX", "GyrY", "GyrZ")
     assert (source.columns.unit, source.clock.unit, source.clock.rate) == ("m/s^2", "us", pytest.approx(50.0))
-    assert source.form.source_format == "text, comma"
+    assert source.form.source_format == "csv"
     assert "ArduPilot log: message IMU taken by its FMT line" in source.notes
 
 

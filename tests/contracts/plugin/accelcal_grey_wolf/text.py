@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from accelcal_cli.calibration.result import Calibration
-from accelcal_cli.exporters.base import Exporter, origin, rows
+from accelcal_cli.exporters.base import Exporter, rows
 from accelcal_cli.schema import setting
 
 
@@ -19,7 +19,8 @@ class Text(Exporter):
 
     def content(self, result: Calibration) -> bytes:
         """Return the origin and the numbers, a matrix row per line."""
-        lines = [*origin(result), "K_a", *map(self._line, rows(result.K_a)), "D_a", self._line(result.D_a)]
+        numbers = ["K_a", *map(self._line, rows(result.K_a)), "D_a", self._line(result.D_a)]
+        lines = [*self.header(result), *numbers]
         return ("\n".join(lines) + "\n").encode()
 
     def _line(self, values: list[float]) -> str:
