@@ -28,7 +28,7 @@ import numpy as np
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_quantile
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
-from accelcal_cli.calibration.sample import Sample
+from accelcal_cli.calibration.sample import NO_NOISE, Sample
 
 COVERAGE = 0.95
 """Part of the intervals that hold the true value."""
@@ -81,10 +81,13 @@ class PoseNoise:
             return np.asarray(np.sum(part, axis=1) ** 2 / spread)
 
 
-def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None) -> PoseNoise | None:
+def pose_noise(
+    sample: Sample, K: Float, D: Float, g: float, shakes: Tremor | None = None
+) -> PoseNoise | None:
     """Return the noise of poses whose readings scatter, seen with sensors K, shape (R, 3, 3), and D, shape (R, 3).
 
-    None where no reading tells its scatter. What trembling adds across the force is no noise of the length.
+    None where no reading tells its scatter. What trembling adds across the force is no noise of the length, and a
+    scatter below NO_NOISE of g, m/s^2, is rounding.
     """
     if sample.scatter is None or sample.count is None:
         return None
@@ -106,6 +109,7 @@ def pose_noise(sample: Sample, K: Float, D: Float, shakes: Tremor | None = None)
     known: Bool = np.asarray((np.isfinite(sample.count) | ~real).all(axis=1) & (own.sum(axis=1) > 0))
     if shakes is not None:
         known &= _crossed(sample) | ~shakes.sure
+    known &= (expected * scale).max(axis=1) > (NO_NOISE * g) ** 2
     return PoseNoise(expected * scale, pooled[:, None] * scale[..., None, None], own, prior[:, 0], known)
 
 

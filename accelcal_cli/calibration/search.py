@@ -322,7 +322,7 @@ def _with_noise(stated: Stated) -> Stated:
         cost, sources = opened(sample, stated.settings, stated.weights)
         stated = replace(stated, sample=sample, tremor=trembling, cost=cost, sources=sources)
         K, D = cost.parameters(least_point(cost))
-    return replace(stated, noise=pose_noise(sample, K, D, stated.tremor))
+    return replace(stated, noise=pose_noise(sample, K, D, g, stated.tremor))
 
 
 def unsearched(stated: Stated) -> Solution:
@@ -458,7 +458,7 @@ def share(
         return stated, 0.0
     own = stated.noise.variance[0]
     e = np.concatenate([part[0] for _, part, _ in sample.errors(*sensors, stated.settings.g)])
-    if stated.own is None and (own > 0).all():
+    if stated.own is None and stated.noise.known[0] and (own > 0).all():
         stated = replace(stated, own=(float(np.sum(e[counted] ** 2 / own[counted])), freedom))
     shared = max(shared_variance(e[counted], own[counted], freedom), LEAST_SHARED * float(own.mean()))
     weights = sample.normalised(1.0 / (shared + own)[None])

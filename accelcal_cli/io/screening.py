@@ -27,6 +27,7 @@ from accelcal_cli.io.ties import (
     coarsest_step,
     exact,
     grid_step,
+    is_stepped,
     quadric_terms,
     unscattered,
 )
@@ -357,7 +358,8 @@ class Screened:
         if self.behind is None or self.scatter is None:
             return
         step = self._row_steps
-        coarse = np.flatnonzero(step > COARSE * self._usual_scatter)
+        stepped = [is_stepped(axis, own) for axis, own in zip(self.behind.head.T, step, strict=True)]
+        coarse = np.flatnonzero((step > COARSE * self._usual_scatter) & stepped)
         if len(coarse):
             names = ", ".join(f'"{self.names[axis]}"' for axis in coarse.tolist())
             text = (

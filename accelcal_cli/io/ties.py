@@ -426,6 +426,12 @@ def greatest_step(values: Float) -> float:
     return float(np.quantile(change, 0.25)) if len(change) > 0.1 * len(values) else math.inf
 
 
+def is_stepped(values: Float, step: float) -> bool:
+    """Return whether readings come in such steps: no two of them differ by much less."""
+    gaps = np.diff(np.unique(values))
+    return bool(step > 0 and len(gaps) and gaps.min() > 0.5 * step)
+
+
 def coarsest_step(values: Float) -> float:
     """Return the step that readings of an axis in time seem to have: the least difference where they seldom change."""
     step, gaps = greatest_step(values), np.diff(np.unique(values))

@@ -319,3 +319,12 @@ def test_a_log_of_faces_is_enough_without_misalignments(run):
         )
         one = json.loads(done.out)
         assert (done.code, one["poses"], one["settings"]["weights"]) == (0, 6, "n")
+
+
+def test_a_log_without_noise_is_good_and_nothing_speaks_against_it(run):
+    """What rounding leaves is neither noise nor a coarse step."""
+    for seed in ("1", "2"):
+        run("simulate", "--raw", "--noise", "0", "--seed", seed, "-o", "still.csv")
+        result = run("calibrate", "still.csv", "--raw", "--format", "json", "-q")
+        record = json.loads(result.out)
+        assert (result.code, record["verdict"], record["warnings"]) == (0, "good", [])
