@@ -229,7 +229,9 @@ class Screened:
         width = np.median(np.abs(self.output - middle), axis=0)
         if not (width > 0).all():
             return True
-        radius = np.linalg.norm((self.output - middle) / width, axis=1)
+        with np.errstate(over="ignore"):  # of readings that are no acceleration at all
+            off = np.minimum(np.abs(self.output - middle) / width, 1e100)
+        radius = np.linalg.norm(off, axis=1)
         low, half, high = np.quantile(radius, [0.1, 0.5, 0.9])
         return bool(high - low > 0.6 * half)
 

@@ -22,14 +22,13 @@ Quantity = Literal[
 
 AXES = "xyz"
 
+# Patterns that few names need are strings: `re` compiles them where they are first asked for.
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]")
 _ALL_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
-_ZONE = re.compile(r",?\s*(?:GMT|UTC)\s*[+-]\d\d:?\d\d\s*$")  # Date Time, GMT-05:00
+_ZONE = r",?\s*(?:GMT|UTC)\s*[+-]\d\d:?\d\d\s*$"  # Date Time, GMT-05:00
 _INDEX = re.compile(r"\[([012])\]\s*$")  # accelerometer_m_s2[0]
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
-_UNIT_WORDS = re.compile(
-    r"g|mg|ug|mps|mps2|ms|ms2|m|s|s2|2|lsb|counts|raw|mv|v|c|degc|celsius|k|pulse|pulses|hz"
-)
+_UNIT_WORDS = r"g|mg|ug|mps|mps2|ms|ms2|m|s|s2|2|lsb|counts|raw|mv|v|c|degc|celsius|k|pulse|pulses|hz"
 MEAN = frozenset({"mean", "avg", "average", "moyenne", "mittelwert"})
 
 UNITS: dict[str, tuple[Quantity, str]] = {
@@ -66,22 +65,18 @@ _SPELLED = {word: name for name, (_, words) in UNITS.items() for word in words.s
 FORCE_UNITS = ("g", "mg", "m/s^2")
 """Units of acceleration that say what 1 g is."""
 
-_ACCELERATION = re.compile(
-    r"acc|acce?l|accel\w*|accelerat\w*|accelero\w*|beschl\w*|acz|ac|gforce|gf|specificforce"
-)
+_ACCELERATION = r"acc|acce?l|accel\w*|accelerat\w*|accelero\w*|beschl\w*|acz|ac|gforce|gf|specificforce"
 _FREE = frozenset({"free", "user", "gravityfree", "lin", "ohne", "sans", "without", "dynamic", "la"})
-_KIND: tuple[tuple[Quantity, re.Pattern[str]], ...] = (
+_KIND: tuple[tuple[Quantity, str], ...] = (
     (
         "turning",
-        re.compile(
-            r"gyr\w*|gy|omega|angvel|angular\w*|rotation\w*|rotrate|drehrate\w*|winkelg\w*|rate|w|dps"
-        ),
+        (r"gyr\w*|gy|omega|angvel|angular\w*|rotation\w*|rotrate|drehrate\w*|winkelg\w*|rate|w|dps"),
     ),
-    ("magnetic", re.compile(r"mag|magn\w*|compass|b|h|m")),
-    ("gravity", re.compile(r"grav|gravit\w*|schwerkraft")),
+    ("magnetic", (r"mag|magn\w*|compass|b|h|m")),
+    ("gravity", (r"grav|gravit\w*|schwerkraft")),
     (
         "other",
-        re.compile(
+        (
             r"q|quat\w*|roll|pitch|yaw|euler\w*|angle|angles|att\w*|ori|orientation\w*|vel|velocity|speed|gps|pos|"
             r"position\w*|lat|lon|alt|setpoint|axis[pidf]|motor|servo|delta\w*|dv|dq|baro\w*|light|lux|pressure|humid\w*"
         ),
@@ -111,12 +106,12 @@ _TAIL = frozenset(
         "smooth",
     }
 )
-_TIME_WORDS = re.compile(
+_TIME_WORDS = (
     r"(?:t|time|timestamp|timestamps|stamp|sec|seconds|zeit|zeitstempel|temps|horodatage|utc|date|datetime|datum|millis|"
     r"micros|epoch|epoc|unix|elapsed|uptime|clock|uhrzeit|heure|tow|datenum)+(?:ns|us|usec|ms|msec|s|utc|local|unix|"
     r"cal|fine|sincestart|sincereboot|ofday)*(?:unix|cal|instant)*"
 )
-_TEMPERATURE = re.compile(
+_TEMPERATURE = (
     r"(?:\w*?(?:imu|acc|accel|gyro|sensor|chip|die|board|baro|device|s))?(?:temp|temperature|temperatur|tempc|tmp|degc)"
     r"(?:c|degc|cal|sensor|imu)?|t_?(?:imu|acc|accel|chip|die|sensor)"
 )
@@ -129,7 +124,7 @@ SHOWN = 20
 """Column names that a message lists at most."""
 
 _SPREAD = frozenset({"std", "sd", "sigma", "stdev", "stddev"})
-_SPREAD_GLUED = re.compile(r"(?:std|sd|sigma|s)([xyz])")
+_SPREAD_GLUED = r"(?:std|sd|sigma|s)([xyz])"
 
 _ACCELERATION_NAMES = ("acc", "accel", "acceleration", "accelerometer", "linearacceleration")
 _OUTPUT = (
@@ -150,27 +145,25 @@ _GYRO = (
     *("w", "g", "gy", "gyr", "gyro", "gyroscope", "gyrorad"),
     *("omega", "angvel", "angularvelocity", "rotationrate"),
 )
-_CAPITAL_T = re.compile(r"T(?:_?(?:deg)?[cCkK]|\s*[\[(]\s*(?!m?s\b).*)?")  # t would be time
+_CAPITAL_T = r"T(?:_?(?:deg)?[cCkK]|\s*[\[(]\s*(?!m?s\b).*)?"  # t would be time
 _ALONE = {
-    "temperature": re.compile(r"temperature|temp"),
-    "label": re.compile(
-        r"pose|poses|poseid|poselabel|posename|position|positionid|pos|label|orientation|face"
-    ),
-    "count": re.compile(r"n|count|counts|samples|nsamples|numsamples|npoints"),
-    "sensor": re.compile(
+    "temperature": (r"temperature|temp"),
+    "label": (r"pose|poses|poseid|poselabel|posename|position|positionid|pos|label|orientation|face"),
+    "count": (r"n|count|counts|samples|nsamples|numsamples|npoints"),
+    "sensor": (
         r"(?:sensor|device|serial|imu|accelerometer|dut|node|board|chip|module|unit|part)"
         r"(?:id|no|nr|num|number|name|label|serial|serialno|serialnr|serialnumber|sn)|sensors?|device|serial|sn|imu|dut"
     ),
-    "instance": re.compile(r"(?:imu|sensor|acc|accel)?instance(?:id|no|nr|num|number)?"),
-    "kind": re.compile(r"(?:sensor|data|msg|message)?(?:type|kind)|topic|channel|measurement"),
-    "other": re.compile(
+    "instance": (r"(?:imu|sensor|acc|accel)?instance(?:id|no|nr|num|number)?"),
+    "kind": (r"(?:sensor|data|msg|message)?(?:type|kind)|topic|channel|measurement"),
+    "other": (
         r"|t|time|timestamp|stamp|start|end|stop|tstart|tend|starttime|endtime|index|row|sec|seconds|id"
     ),
 }
 """Roles of single columns, by their names without separators; those of `other` are not readings."""
 
-_TIME = re.compile(r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?")
-_SENSOR_PERHAPS = re.compile(r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer")
+_TIME = r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?"
+_SENSOR_PERHAPS = r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer"
 
 _RATE = r"(\d+(?:\.\d+)?)\s*hz\b"  # compiled where there is something above a table
 _RATE_NAMED = (
@@ -268,7 +261,7 @@ def tokens_of(name: str) -> list[str]:
     words = re.findall(r"[a-z0-9]+", _CAMEL.sub("_", _ALL_BRACKETS.sub(" ", name)).lower())
     while (
         len(words) > 1
-        and _UNIT_WORDS.fullmatch(words[-1])
+        and re.fullmatch(_UNIT_WORDS, words[-1])
         and (words[-1] != "2" or words[-2] in ("s", "ms", "m"))
     ):
         words.pop()
@@ -279,7 +272,7 @@ def tokens_of(name: str) -> list[str]:
 
 def is_time(name: str) -> bool:
     """Return whether a column is time by its name: t, Zeit (s), timestamp_ms, S_Timestamp_Unix_CAL."""
-    words = tokens_of(_ZONE.sub("", name))
+    words = tokens_of(re.sub(_ZONE, "", name))
     while words and words[0] in (
         "s",
         "sensor",
@@ -296,12 +289,12 @@ def is_time(name: str) -> bool:
             words[2:] if words[1:] and words[1].isalnum() and any(map(str.isdigit, words[1])) else words[1:]
         )
     key = "".join(words)
-    return bool(_TIME_WORDS.fullmatch(key))
+    return bool(re.fullmatch(_TIME_WORDS, key))
 
 
 def is_temperature(name: str) -> bool:
     """Return whether a column is a temperature by its name."""
-    return bool(_TEMPERATURE.fullmatch("".join(tokens_of(name))))
+    return bool(re.fullmatch(_TEMPERATURE, "".join(tokens_of(name))))
 
 
 def describe(name: str) -> Meaning:
@@ -348,12 +341,12 @@ def _axis_word(words: Sequence[str]) -> tuple[int | None, int | None, int | None
 
 def _quantity(words: Sequence[str]) -> Quantity | None:
     """Return the quantity that some word names."""
-    if any(_ACCELERATION.fullmatch(word) for word in words):
+    if any(re.fullmatch(_ACCELERATION, word) for word in words):
         if "angular" in words:
             return "turning"
         return "gravity-free" if _FREE & set(words) else "acceleration"
     for quantity, pattern in _KIND:
-        if any(pattern.fullmatch(word) for word in words):
+        if any(re.fullmatch(pattern, word) for word in words):
             return quantity
     return None
 
@@ -392,9 +385,12 @@ def recognise(names: Sequence[str]) -> Roles:
         words = tokens_of(name)
         key = "".join(words)
         timed = parse_unit(next(reversed(_BRACKETS.findall(name)), "")) in TIME_UNITS
-        if timed or _TIME.fullmatch(key) or is_time(name):
+        if key and not timed and key[-1] in AXES and key[:-1] in _OUTPUT and key[:-1] not in _REFERENCE:
+            _put(output, (key[:-1], key[-1]), column)  # the commonest names, without a look at any other
+            continue
+        if timed or re.fullmatch(_TIME, key) or is_time(name):
             roles.alone["time"].append(column)
-        if _SENSOR_PERHAPS.fullmatch(key):
+        if re.fullmatch(_SENSOR_PERHAPS, key):
             roles.alone["perhaps sensor"].append(column)
         if role := _role(name, key) or ("other" if timed else None):
             roles.alone[role].append(column)
@@ -450,11 +446,11 @@ def _describe_rest(names: Sequence[str], columns: Sequence[int], roles: Roles) -
 
 def _role(name: str, key: str) -> str | None:
     """Return the role of a single column, None for an axis and for an unknown name."""
-    if _CAPITAL_T.fullmatch(name.strip()):
+    if re.fullmatch(_CAPITAL_T, name.strip()):
         return "temperature"
     if name.strip() == "I":  # the instance, in the logs of ArduPilot
         return "instance"
-    role = next((role for role, pattern in _ALONE.items() if pattern.fullmatch(key)), None)
+    role = next((role for role, pattern in _ALONE.items() if re.fullmatch(pattern, key)), None)
     if role is None and is_temperature(name):
         return "temperature"
     return "other" if role is None and is_time(name) else role
@@ -473,7 +469,7 @@ def _spread(words: Sequence[str], key: str) -> tuple[str, str] | None:
     rest = "".join(word for word in words if word not in _SPREAD)
     if rest and len(rest) < len(key):
         return _axis(rest, _OUTPUT)
-    glued = _SPREAD_GLUED.fullmatch(key)
+    glued = re.fullmatch(_SPREAD_GLUED, key)
     return ("", glued[1]) if glued else None
 
 
