@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal
+
+from accelcal_cli.schema import frozen
 
 Severity = Literal["note", "warning"]
 
@@ -12,7 +13,7 @@ COMMAND = "accelcal "
 """How a remedy begins that is a command line."""
 
 
-@dataclass(frozen=True)
+@frozen()
 class Notice:
     """A sentence about readings or a result.
 

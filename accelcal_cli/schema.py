@@ -14,12 +14,70 @@ import operator
 import re
 import types
 import typing
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar, dataclass_transform
 
 from accelcal_cli.errors import ConfigError, did_you_mean
 
 T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def frozen(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
+    """Make a frozen dataclass in a third of the time that `dataclass` takes; without `eq` compared by identity.
+
+    `dataclass` writes and compiles six methods for each class, and a start of the command line makes eighty classes.
+    Here all classes share five of them.
+
+        >>> @frozen()
+        ... class Point:
+        ...     x: float
+        >>> Point(1.0), Point(1.0) == Point(1.0)
+        (Point(x=1.0), True)
+    """
+    shared = {"__setattr__": _set_once, "__delattr__": _delete, "__repr__": _shown}
+    if eq:
+        shared |= {"__eq__": _equal, "__hash__": _hash}
+
+    def make(cls: type[T]) -> type[T]:
+        made = dataclasses.dataclass(eq=False, repr=False)(cls)
+        for name, method in shared.items():
+            if name not in cls.__dict__:
+                setattr(made, name, method)
+        return made
+
+    return make
+
+
+def _set_once(self: object, name: str, value: object) -> None:
+    """Set a field that has no value yet, as `__init__` does."""
+    if name in self.__dict__:
+        raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+    object.__setattr__(self, name, value)
+
+
+def _delete(_: object, name: str) -> None:
+    raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
+
+
+def _equal(self: object, other: object) -> bool:
+    return _compared(self) == _compared(other) if type(other) is type(self) else NotImplemented
+
+
+def _hash(self: object) -> int:
+    return hash(_compared(self))
+
+
+def _shown(self: object) -> str:
+    fields = dataclasses.fields(self)  # type: ignore[arg-type]
+    shown = ", ".join(f"{f.name}={getattr(self, f.name)!r}" for f in fields if f.repr)
+    return f"{type(self).__qualname__}({shown})"
+
+
+def _compared(self: object) -> tuple[object, ...]:
+    fields = dataclasses.fields(self)  # type: ignore[arg-type]
+    return tuple(getattr(self, f.name) for f in fields if f.compare)
+
 
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import pickle
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -14,7 +16,7 @@ from hypothesis import strategies as st
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.schema import Limits, array, check, from_mapping, setting, to_mapping
+from accelcal_cli.schema import Limits, array, check, from_mapping, frozen, setting, to_mapping
 
 
 @dataclass(frozen=True)
@@ -253,3 +255,40 @@ def test_a_fault_of_a_record_is_named_with_its_place(changed, words):
 def test_what_is_missing_is_named():
     with pytest.raises(ConfigError, match="r: missing: matrix, free"):
         from_mapping(Record, {k: v for k, v in PLAIN.items() if k not in ("matrix", "free")}, "r")
+
+
+@frozen()
+class Point:
+    """A record with a hidden and an uncompared field."""
+
+    x: float
+    note: str = field(default="", compare=False)
+    cache: list[int] = field(default_factory=list, compare=False, repr=False)
+
+
+@frozen(eq=False)
+class Cloud:
+    """A record of an array, which has no truth value to compare."""
+
+    x: np.ndarray
+
+
+def test_a_frozen_record_is_a_frozen_dataclass():
+    point = Point(1.0, "here")
+    assert (point, hash(point)) == (Point(1.0), hash(Point(1.0)))
+    assert point != Point(2.0)
+    assert point != 1.0
+    assert repr(point) == "Point(x=1.0, note='here')"
+    assert dataclasses.replace(point, x=2.0) == Point(2.0)
+    assert pickle.loads(pickle.dumps(point)) == point
+    for change in (lambda: setattr(point, "x", 3.0), lambda: delattr(point, "x")):
+        with pytest.raises(dataclasses.FrozenInstanceError, match="x"):
+            change()
+    assert point.x == 1.0
+
+
+def test_a_record_without_equality_is_itself_alone():
+    cloud = Cloud(np.zeros(2))
+    assert cloud == cloud
+    assert cloud != Cloud(cloud.x)
+    assert len({cloud, Cloud(cloud.x)}) == 2

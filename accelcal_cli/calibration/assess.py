@@ -7,7 +7,6 @@ fit and the search. The verdict is of the calibration, of both together. Arrays 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -28,6 +27,7 @@ from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE, axis_up
 from accelcal_cli.calibration.search import rounding
 from accelcal_cli.notices import Notice, Severity, are_serious
+from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES
 
@@ -94,7 +94,7 @@ NEAR_NOMINAL, ALIKE = 0.005, 1.0 / 3.0
 """Scale factors this far from a stated nominal sensor, all by the same within ALIKE of it, are rather a wrong g."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Assessment:
     """What is said of the fit of R sensors.
 

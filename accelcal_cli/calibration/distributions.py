@@ -13,12 +13,12 @@ probability `EQUAL`, else a ratio that is spread over a factor of e^SPREAD eithe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
+from accelcal_cli.schema import frozen
 
 EQUAL, SPREAD = 0.85, 1.0
 """Unchanged sensors are called changed at the 5 % level in 3.8 to 5.3 % of all cases at equal noise, whatever the two
@@ -31,7 +31,7 @@ MOST_TERMS = 2000
 """Degrees of freedom up to which Student's distribution is summed term by term; scipy, slow to load, takes the rest."""
 
 
-@dataclass(frozen=True)
+@frozen()
 class Noise:
     """Variance of one pose's residual, (m/s^2)^2, and the degrees of freedom behind it, whole or not (0: not known)."""
 
@@ -39,7 +39,7 @@ class Noise:
     freedom: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Pair:
     """Two noises, and what they say of each other: squares of ratios b / a and their weights, both shape (n,)."""
 

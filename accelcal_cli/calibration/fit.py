@@ -6,7 +6,7 @@ Everything is in gauge `lower` and of the nine parameters of `observability`, wh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -42,6 +42,7 @@ from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error, loss
 from accelcal_cli.calibration.search import SLOPES, Search, Solution, state, unsearched
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
+from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.model import ErrorModel, Gauge, misalignment, to_gauge
 
 EDGE = 1e-6
@@ -56,7 +57,7 @@ on all axes; for any attitudes that adds UNALIKE (s/g) sqrt(J) sigma, and 2 to 3
 as noisy."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Fit:
     """What R sensors are found to be, and how well their readings say so.
 
@@ -176,7 +177,7 @@ class Fit:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Point:
     """The sensors of a solution, and what the readings say of them.
 
@@ -245,7 +246,7 @@ def fit(solution: Solution) -> Fit:
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class QuickFit:
     """What the least cost says of one sensor, without search, noise bias and covariance: it compares sets of poses.
 

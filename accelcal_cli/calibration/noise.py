@@ -29,6 +29,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_quantile
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
 from accelcal_cli.calibration.sample import NO_NOISE, Sample
+from accelcal_cli.schema import frozen
 
 COVERAGE = 0.95
 """Part of the intervals that hold the true value."""
@@ -52,7 +53,7 @@ SURELY_TREMBLES = 4.0
 """Standard deviations of the tangential excess beyond which a hand trembles: by chance 1 in 30 000."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseNoise:
     """The noise of the poses of R sensors, by the scatter of their readings.
 
@@ -211,7 +212,7 @@ def alike_weights(sample: Sample) -> Float:
     return sample.normalised(sample.count * (prior + 3.0 * own) / (prior * middle + 3.0 * own * ratio))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Tremor:
     """What trembling takes off the mean of each pose.
 
@@ -292,7 +293,7 @@ FEWEST_JUMPS = 8
 """Jumps of the attitude from which on what is between them is a pose, and rows of one pose are not independent."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NoiseSpread:
     """The noise of a fit and what it does to the parameters, for R sensors.
 

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.model import AXIS_PAIRS, ErrorModel, bias_force, misalignment, sensitivity
 from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
@@ -88,7 +89,7 @@ more than 1000 times the noise of a pose. Without it a direction that the poses 
 parameter along that it touches by a part in a thousand."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Observability:
     """What sets of poses say about the parameters, for one set or for R of them (leading axis R).
 
@@ -202,7 +203,7 @@ CELLS = 64
 NEAR = float(np.cos(np.radians(APART)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Geometry:
     """What the distinct attitudes of R sensors determine.
 

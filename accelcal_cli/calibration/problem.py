@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from accelcal_cli.arrays import Float, Int
 from accelcal_cli.calibration.observability import ROWS_COLUMNS
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.optimization.problem import Problem
+from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.model import to_gauge
 
 PAIRS = (np.array([0, 1, 2, 0, 0, 1, 0, 1, 2, 3]), np.array([0, 1, 2, 1, 2, 2, 3, 3, 3, 3]))
@@ -52,7 +52,7 @@ def unpack(theta: Float) -> tuple[Float, Float]:
     return K, theta[..., -3:]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Box:
     """The search box in the units of the readings.
 
@@ -296,7 +296,7 @@ PIECE = 512
 """Rows of one small QR; LAPACK's panel of 512 x 11 stays in the first-level cache."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Triangle:
     """The compressed readings of R sensors.
 

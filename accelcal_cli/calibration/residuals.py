@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_chance
 from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
 from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error
+from accelcal_cli.schema import frozen
 
 KEPT = 1000
 """Poses whose residuals a fit keeps one by one; of more, the worst KEPT_WORST."""
@@ -39,7 +38,7 @@ RIDGE = 1e-14
 """Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseResiduals:
     """Residuals of k poses of each of R sensors.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
 
@@ -33,7 +33,7 @@ from accelcal_cli.calibration.settings import LARGEST
 from accelcal_cli.config import parse_mapping, read_text
 from accelcal_cli.errors import ConfigError, DataError, UsageError
 from accelcal_cli.notices import Notice
-from accelcal_cli.schema import Limits, array, from_mapping, to_mapping
+from accelcal_cli.schema import Limits, array, from_mapping, frozen, to_mapping
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, ErrorModel, Gauge
 
 NEAR_G = 0.02
@@ -63,7 +63,7 @@ Matrix = Annotated[Float, array(3, 3)]
 """Numbers and arrays as a result file has them; those that may be missing are null there."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Temperature:
     """How a sensor changes with temperature; the other parameters of a result hold at `reference`.
 
@@ -107,7 +107,7 @@ class Temperature:
         return np.asarray((output - D - self.bias * t) / (1.0 + self.scale * t) + D)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sigma:
     """One-sigma of the parameters, or the half-widths of their intervals; NaN where the poses do not determine them.
 
@@ -123,7 +123,7 @@ class Sigma:
 NO_INTERVAL = Sigma(np.full((3, 3), np.nan), np.full(3, np.nan))
 
 
-@dataclass(frozen=True)
+@frozen()
 class Dop:
     """Dilution of precision: the error of a parameter, as m/s^2 at 1 g, over the noise of one pose in m/s^2.
 
@@ -148,7 +148,7 @@ class Dop:
         )
 
 
-@dataclass(frozen=True)
+@frozen()
 class PoseFit:
     """One pose. Units: m/s^2 (units of g when g = 1).
 
@@ -173,7 +173,7 @@ class PoseFit:
     direction: tuple[float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Calibration:
     """A calibrated accelerometer. Units: f in m/s^2 (units of g when g = 1), N in output units.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.io.screening import LOOKED_AT
+from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.poses import AXES
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def _name_up(where: Callable[[int], str], poses: Iterable[int]) -> bool:
     return axis_up(first) is not None or any(axis_up(name) is not None for name in names)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sample:
     """Poses of R sensors, J at most; a sensor with fewer repeats its last one, and the repetitions count nothing.
 

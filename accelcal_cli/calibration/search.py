@@ -10,7 +10,7 @@ J - 9 [paule1982].
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from accelcal_cli.calibration.settings import BoxSettings, Settings
 from accelcal_cli.optimization.minimize import Run, minimize, polish
 from accelcal_cli.optimization.optimizer import Optimizer, State
 from accelcal_cli.rng import Purpose, Streams
+from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.model import to_gauge
 
 SHIFT = 0.5
@@ -57,7 +58,7 @@ SLOPES = 6
 """Parameters more where scale factors and biases are linear in temperature."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Stated:
     """The problem of R sensors as it is stated.
 
@@ -88,7 +89,7 @@ class Stated:
         return replace(self, weights=weights, cost=cost, sources=sources)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Search:
     """What a search found, and at what expense.
 
@@ -111,7 +112,7 @@ class Search:
     best: Int | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Slopes:
     """A fit of fifteen parameters; see calibration.temperature.
 
@@ -145,7 +146,7 @@ class Slopes:
         return replace(self.temperature, covariance=joint, sigma_scale=scale, sigma_bias=bias)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Solution:
     """What search, polish and robust rounds found.
 

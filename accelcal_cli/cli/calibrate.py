@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +12,7 @@ import typer
 
 from accelcal_cli.cli import options, process
 from accelcal_cli.errors import UsageError
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
@@ -26,7 +27,7 @@ ATTITUDES = ("unknown", "known")
 in_model, in_search = options.panel("Model"), options.panel("Search")
 
 
-@dataclass(frozen=True)
+@frozen()
 class ModelOptions:
     """What is estimated, and how much each pose counts; keys of the settings."""
 
@@ -73,7 +74,7 @@ class ModelOptions:
     ] = None
 
 
-@dataclass(frozen=True)
+@frozen()
 class SearchOptions:
     """How the parameters are searched; keys of the settings, and parameters that most optimizers have."""
 

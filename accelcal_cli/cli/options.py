@@ -12,7 +12,7 @@ import os
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -22,6 +22,7 @@ import typer
 
 from accelcal_cli.errors import UsageError, did_you_mean, visible
 from accelcal_cli.registry import is_mentioned
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
@@ -174,7 +175,7 @@ Format = Annotated[
 Quiet = Annotated[bool, in_output("--quiet", "-q", help="Print nothing on standard error but errors.")]
 
 
-@dataclass(frozen=True)
+@frozen()
 class GravityOptions:
     """Local gravity, stated in one of two ways or not at all."""
 
@@ -221,7 +222,7 @@ class GravityOptions:
         return None if self.latitude is None else normal_gravity(self.latitude, self.height or 0.0)
 
 
-@dataclass(frozen=True)
+@frozen()
 class TextOptions:
     """Which rows of a table to read, and what a user knows of its form."""
 
@@ -273,7 +274,7 @@ FACES = 6
 in_log = panel("Raw log")
 
 
-@dataclass(frozen=True)
+@frozen()
 class DetectionOptions:
     """How static poses are found in a raw log, as `detect` and `calibrate --raw` take it."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from accelcal_cli.io.vocabulary import (
     parse_unit,
     recognise,
 )
+from accelcal_cli.schema import frozen
 
 COUNTED = 16
 """Digits from which on a time is read as an integer: a 64-bit float would round it."""
@@ -56,7 +57,7 @@ CONSTANT = 0.15
 """Part of its length by which acceleration at rest differs from gravity: errors of scale and bias."""
 
 
-@dataclass(frozen=True)
+@frozen()
 class Columns:
     """Columns of a table of readings, counted from 0; None where there are none.
 
@@ -124,7 +125,7 @@ def are_no_counts(count: Float) -> Bool:
     return np.asarray((count < 1) | (count != np.round(count)))
 
 
-@dataclass(frozen=True)
+@frozen()
 class RawColumns:
     """Columns of a raw log, counted from 0.
 

@@ -13,7 +13,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
 from accelcal_cli.errors import DataError
@@ -27,6 +27,7 @@ from accelcal_cli.io.vocabulary import (
     parse_unit,
     read_facts,
 )
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     from accelcal_cli.io.lines import LineFilter, MessageFilter
@@ -79,7 +80,7 @@ class ThousandsError(DataError):
     """Commas separate thousands; no other reading of the text helps."""
 
 
-@dataclass(frozen=True)
+@frozen()
 class Dialect:
     """The form of a text table. `separator` " " stands for runs of blanks and tabs.
 
@@ -118,7 +119,7 @@ class Dialect:
         return [skipped + f": {facts}" * bool(facts)] if above or facts else []
 
 
-@dataclass(frozen=True)
+@frozen()
 class Layout:
     """Lines of a sample by what they are, numbered from 0.
 

@@ -36,6 +36,7 @@ from accelcal_cli.io.dialect import (
 from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
 from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
 from accelcal_cli.io.vocabulary import Facts
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     import polars as pl
@@ -54,7 +55,7 @@ NEARBY = 1000
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
 
 
-@dataclass(frozen=True)
+@frozen()
 class ReadOptions:
     """What a user states about the form of a table.
 
@@ -76,7 +77,7 @@ class ReadOptions:
 PLAIN = ReadOptions()
 
 
-@dataclass(frozen=True)
+@frozen()
 class Selection:
     """Columns to read, counted from 0."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import BinaryIO, Generic, Self, TypeVar
 
@@ -24,6 +24,7 @@ from accelcal_cli.io.rows import DeadColumns, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 from accelcal_cli.notices import Notice
+from accelcal_cli.schema import frozen
 
 HEAD = 1024
 """Rows of labelled poses that are kept to see in what steps the readings come."""
@@ -37,7 +38,7 @@ MOST_LABELS = 1_000_000
 Label = TypeVar("Label", bound=Hashable)
 
 
-@dataclass(frozen=True)
+@frozen()
 class InputForm:
     """How an input is written.
 
@@ -55,7 +56,7 @@ class InputForm:
     unit: str | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Readings:
     """Static readings of one sensor, one row per pose; rows with one label are averaged.
 

@@ -26,6 +26,7 @@ from accelcal_cli.errors import DataError
 from accelcal_cli.io.dialect import BOM, MARKS, Dialect, is_blank, is_comment, split_cells
 from accelcal_cli.io.vocabulary import is_kind
 from accelcal_cli.notices import Notice
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     import polars as pl
@@ -64,7 +65,7 @@ KIND_OF_SENSOR = re.compile(r"acc|gyr|mag|baro|imu|linear|gravity|rot|compass|te
 ACCELEROMETER = re.compile(r".*acc", re.IGNORECASE)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RowBlock:
     """Rows of a table: `numbers` (B, k) and `texts`, each of length B, in the order of the selection.
 
@@ -164,7 +165,7 @@ class PassedLines:
         return number if self.kept is None else self.kept.line(number)
 
 
-@dataclass(frozen=True)
+@frozen()
 class Condition:
     """A column, counted from 0 and by name, and the value that a row must have there, as text."""
 

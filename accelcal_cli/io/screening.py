@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -32,6 +31,7 @@ from accelcal_cli.io.ties import (
     unscattered,
 )
 from accelcal_cli.notices import COMMAND, Notice
+from accelcal_cli.schema import frozen
 
 LOOKED_AT = 4096
 """Poses that are looked at: the first."""
@@ -123,7 +123,7 @@ def _thickness(output: Float) -> float:
     return math.sqrt(float((off**2).sum()) / (len(x) - 4))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Screened:
     """Poses of one sensor, to be screened.
 

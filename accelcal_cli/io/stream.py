@@ -24,6 +24,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, did_you_mean
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     from zipfile import ZipFile
@@ -215,7 +216,7 @@ def _neighbour(path: Path) -> str:
     return did_you_mean(path.name, names)
 
 
-@dataclass(frozen=True)
+@frozen()
 class Unpacked:
     """A stream of plain text or Parquet.
 

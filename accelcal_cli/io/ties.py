@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.schema import frozen
 
 CHANCE = 5e-4
 """Greatest chance of a pattern in honest readings at which it is reported."""
@@ -78,7 +79,7 @@ def exact(output: Float) -> Float:
     return np.round(output, DIGITS - math.ceil(math.log10(size))) if size > 0 else output
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Surface:
     """The quadric nearest to some poses, and how far they are off it.
 
@@ -156,7 +157,7 @@ class Stuck(NamedTuple):
     end: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Ties:
     """How the values of some poses repeat.
 

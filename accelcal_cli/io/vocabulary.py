@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
 
+from accelcal_cli.schema import frozen
+
 Quantity = Literal[
     "acceleration", "gravity-free", "gravity", "turning", "magnetic", "time", "temperature", "other"
 ]
@@ -184,7 +186,7 @@ DEVICE_UNITS = {"ActiGraph": "g", "GENEActiv": "g", "Axivity": "g", "AX3": "g"}
 """Units of acceleration of devices that do not write it, by a word of the preamble."""
 
 
-@dataclass(frozen=True)
+@frozen()
 class Meaning:
     """What a name says: the quantity, or None; the family, the name without its axis; the axis 0 to 2, or None.
 
@@ -505,7 +507,7 @@ def is_kind(name: str) -> bool:
     return bool(recognise((name,)).alone["kind"])
 
 
-@dataclass(frozen=True)
+@frozen()
 class Facts:
     """What stands above a table, as far as it was understood.
 

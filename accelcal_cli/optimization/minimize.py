@@ -7,7 +7,7 @@ trace, stopping, and the status of each run. A numerical failure is the status o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.optimization.optimizer import Optimizer, S, Status, take
 from accelcal_cli.optimization.problem import Counted, Problem
 from accelcal_cli.rng import Streams
+from accelcal_cli.schema import frozen
 
 N = TypeVar("N", bound=np.generic)
 
@@ -25,7 +26,7 @@ BLOCK_BYTES = 192 * 1024
 hide the interpreter, and a handful of temporaries of that size still fits the second-level cache."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Run:
     """The outcome of R runs.
 
@@ -51,7 +52,7 @@ class Run:
     trace_evaluations: NDArray[np.int64] | None = None
 
 
-@dataclass(frozen=True)
+@frozen()
 class Stopping:
     """When to stop before the iterations run out.
 

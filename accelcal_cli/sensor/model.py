@@ -14,7 +14,6 @@ local gravity: stated, or the normal gravity of WGS84 at a latitude and height.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.linalg import cholesky, eigh, inv, qr, svd
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.schema import frozen
 
 Gauge = Literal["lower", "upper", "symmetric", "full"]
 GAUGES: tuple[str, ...] = get_args(Gauge)
@@ -88,7 +88,7 @@ def triangular(K: Float) -> Float:
     return R.swapaxes(1, 2) * sign[:, None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ErrorModel:
     """Scale factors, misalignments and bias of one accelerometer.
 

@@ -6,14 +6,15 @@ The views of each kind of result return such blocks in reading order; `output.co
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.notices import Notice
+from accelcal_cli.schema import frozen
 
 
-@dataclass(frozen=True)
+@frozen()
 class Column:
     """One column of a Table.
 
@@ -43,7 +44,7 @@ class Column:
         return format(value, "" if isinstance(value, str) else self.format)
 
 
-@dataclass(frozen=True)
+@frozen()
 class Table:
     """Columns and rows with a title; `notes` are sentences under it.
 
@@ -77,7 +78,7 @@ class Table:
         return replace(self, columns=tuple(self.columns[i] for i in keep), rows=rows)
 
 
-@dataclass(frozen=True)
+@frozen()
 class Paragraph:
     """Text for people; an empty one is a blank line.
 
@@ -95,7 +96,7 @@ class Paragraph:
 BLANK = Paragraph()
 
 
-@dataclass(frozen=True)
+@frozen()
 class Conclusion:
     """A verdict, the reasons for it, and what speaks against it.
 
@@ -111,7 +112,7 @@ class Conclusion:
     title: str = "Verdict"
 
 
-@dataclass(frozen=True)
+@frozen()
 class Convergence:
     """Best cost so far against evaluations, on a logarithmic axis.
 
