@@ -32,6 +32,7 @@ from accelcal_cli.calibration.observability import (
     PoseVerdict,
     design,
     distinct,
+    lessened,
     moved_sensor,
     propagate,
     unit,
@@ -410,8 +411,8 @@ def _geometry(
         counted = [cell.distinct() for cell in cells]
         attitudes, once = np.array([n for n, _ in counted]), np.stack([rows for _, rows in counted])
         attitudes = np.where(sample.labelled, sample.poses, attitudes)
-    loss = None if slopes is None else slopes.loss * (attitudes / sample.poses)[:, None, None]
-    once = once if loss is None else once - loss
+    if slopes is not None:
+        once = lessened(once, information + slopes.loss, slopes.loss)
     alike = attitudes == sample.poses
     if solution.stated.settings.weights != "none" or solution.stated.rejected is not None:
         alike = np.zeros_like(alike)

@@ -260,6 +260,27 @@ def _greedy(near: Bool, real: Bool) -> list[int]:
     return middles
 
 
+OPEN = 1e-12
+"""Part of the trace that is added to the diagonal, so that attitudes that leave a direction open have a root, too."""
+
+
+def lessened(once: Float, whole: Float, loss: Float) -> Float:
+    """Return J^T J of attitudes that count once, less the part that slopes take of that of the weighted poses.
+
+    The same part of each direction, whatever the weights are: B (1 - C^-1 L C^-T) B^T with B B^T = once, C C^T = whole.
+
+    Args:
+        once, whole, loss: shape (R, 9, 9); loss: L.
+    """
+    one = np.eye(9)
+    B, C = (
+        np.linalg.cholesky(part + OPEN * np.einsum("rpp->r", part)[:, None, None] * one)
+        for part in (once, whole)
+    )
+    inverse = np.linalg.inv(C)
+    return np.asarray(B @ (one - inverse @ loss @ inverse.swapaxes(1, 2)) @ B.swapaxes(1, 2))
+
+
 @dataclass(eq=False)
 class CellCount:
     """The directions of one sensor's rows by cells of a cube, in constant memory.
