@@ -104,6 +104,10 @@ NOTHING = Behind(np.zeros((0, 3)), np.full(3, np.inf), np.full(3, -np.inf))
 """Before the first reading."""
 
 
+SOUND = 0.75
+"""Part of the poses, those nearest to one surface, that still have to fit two where there are two sensors."""
+
+
 def thickness(output: Float) -> float:
     """Return the scatter of poses, shape (J, 3), about the nearest sphere over their largest standard deviation.
 
@@ -430,14 +434,21 @@ def _block_steps(means: Float, row: Float, blocks: int) -> tuple[Float, Float]:
 def _fit_apart(output: Float, part: Bool) -> bool:
     """Return whether two quadrics, one for each part of the poses, fit beyond chance better than one for all."""
     terms = quadric_terms(output)
-    if terms is None or len(output) < 2 * FEWEST:
+    if terms is None or len(output) < 2 * FEWEST or not _are_apart(terms, part):
         return False
-    squares, freedom = 0.0, len(output) - 18
-    joint = _squares(terms)
-    for half in (part, ~part):
-        squares += _squares(terms[half])
+    # A few wrong poses bend one of the surfaces; of two sensors no pose fits the surface of both.
+    solution = np.linalg.lstsq(terms[:, :9], terms[:, 9])[0]
+    off = np.abs(terms[:, :9] @ solution - terms[:, 9])
+    sound = off <= np.quantile(off, SOUND)
+    enough = min(np.count_nonzero(sound & part), np.count_nonzero(sound & ~part)) >= FEWEST
+    return not enough or _are_apart(terms[sound], part[sound])
+
+
+def _are_apart(terms: Float, part: Bool) -> bool:
+    """Return whether quadrics through two parts of the poses leave less of their terms than one, beyond chance."""
+    joint, squares = _squares(terms), _squares(terms[part]) + _squares(terms[~part])
     return math.isfinite(squares + joint) and bool(
-        _beyond_chance(np.array(joint), np.array(squares), freedom)
+        _beyond_chance(np.array(joint), np.array(squares), len(terms) - 18)
     )
 
 

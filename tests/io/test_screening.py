@@ -349,3 +349,18 @@ def test_the_step_of_a_grid():
 
 def test_a_simulated_set_is_silent():
     assert readings(attitudes("turns", None), model=DPSO, sigma=1e-3).warnings == ()
+
+
+def test_gross_errors_among_sixty_poses_are_not_another_sensor():
+    """Six of sixty poses wrong by up to half of g, wherever they are; a second sensor in every second row is told."""
+    rng = np.random.default_rng(4)
+    said = 0
+    for _ in range(20):
+        u = rng.normal(size=(60, 3))
+        output = 1000.0 * u / np.linalg.norm(u, axis=1)[:, None] + rng.normal(size=(60, 3))
+        wrong = output.copy()
+        wrong[rng.choice(60, 6, replace=False)] *= rng.uniform(1.05, 1.5, (6, 1))
+        said += "several-sensors" in keys(wrong)
+        output[1::2] = output[1::2] * [1.02, 0.98, 1.01] + [20.0, -30.0, 10.0]
+        assert "several-sensors" in keys(output)
+    assert said == 0
