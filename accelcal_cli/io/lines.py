@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
@@ -112,7 +111,6 @@ class LineFilter:
     kind: LineKind
     kinds: tuple[LineKind, ...]
     prefix: str = ""
-    form: ClassVar[str] = "words"
 
     def translate(self, block: bytes) -> bytes:
         """Return a block of lines as rows: one line each, empty where it is of another kind."""
@@ -155,7 +153,6 @@ class MessageFilter:
     message: str
     columns: tuple[str, ...]
     others: tuple[str, ...] = ()
-    form: ClassVar[str] = "comma"
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -52,8 +52,6 @@ NO_LABEL = "is empty; every row needs its label"
 NEARBY = 1000
 """Lines after a broken one that show whether few are."""
 
-SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}
-
 
 @frozen()
 class ReadOptions:

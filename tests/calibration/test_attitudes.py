@@ -7,7 +7,7 @@ import pytest
 from simulated import readings
 
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.observability import CellCount, distinct
+from accelcal_cli.calibration.observability import CellCount, distinct, lessened
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
@@ -68,3 +68,21 @@ def test_many_rows_of_good_attitudes_are_good():
     assert result.geometry.worst == pytest.approx(
         calibrate(readings(poses.turns(), sigma=0.005), FAST).geometry.worst, rel=0.05
     )
+
+
+def test_slopes_take_the_same_part_of_attitudes_whatever_the_weights():
+    """Alike weights take their share of what slopes take; unlike ones leave every direction some information."""
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(1, 36, 9))
+    once = rows.swapaxes(1, 2) @ rows
+    slope = rng.normal(size=(1, 36, 6))
+
+    def taken(w):
+        across = rows.swapaxes(1, 2) @ (w * slope)
+        return across @ np.linalg.inv(slope.swapaxes(1, 2) @ (w * slope)) @ across.swapaxes(1, 2)
+
+    alike = lessened(once, 3.0 * once, 3.0 * taken(np.ones((1, 36, 1))))
+    np.testing.assert_allclose(alike, once - taken(np.ones((1, 36, 1))), rtol=1e-9, atol=1e-8)
+    w = np.exp(2.0 * rng.normal(size=(1, 36, 1)))
+    left = lessened(once, rows.swapaxes(1, 2) @ (w * rows), taken(w))
+    assert 0 < np.linalg.eigvalsh(left).min() < np.linalg.eigvalsh(once).min()
