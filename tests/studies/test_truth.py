@@ -115,12 +115,15 @@ def test_the_table_says_what_it_counts(capsys):
 
 def test_a_table_is_written_into_the_page(tmp_path, capsys):
     page = tmp_path / "trust.md"
-    page.write_text((ROOT / "docs/explanation/trust.md").read_text(encoding="utf-8"), encoding="utf-8")
+    before = (ROOT / "docs/explanation/trust.md").read_text(encoding="utf-8")
+    page.write_text(before, encoding="utf-8")
     truth.main(["--draws", "1", "--only", "corners", "--jobs", "1", "--write", str(page)])
     text = page.read_text(encoding="utf-8")
     assert text.count("| corners only |") == 4
     assert "Remarks" not in text
-    assert text.endswith("<!-- end -->\n")
+    start, end = before.index("<!-- truth: traps -->"), before.index("<!-- end -->")
+    assert text.startswith(before[:start]), "what stands before the table is not the table's"
+    assert text.endswith(before[end:]), "nor what stands behind it"
     assert capsys.readouterr().out.count("| corners only |") == 4
 
 
