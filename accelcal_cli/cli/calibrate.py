@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
 
-SUFFIXES = (".yaml", ".yml", ".json")
-"""Endings of a result file; they choose its form."""
-
 ROBUST = ("none", "huber", "soft-l1")
 ATTITUDES = ("unknown", "known")
 
@@ -176,14 +173,13 @@ def command(
 
 def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Settings:
     """Return the settings; poses of a raw log are weighted unless the file says otherwise."""
-    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.calibration.settings import load_settings, weights_of_log
     from accelcal_cli.config import load_mapping
 
     if raw:
         keys = {} if config is None else load_mapping(config)
         if "weights" not in keys:
-            aligned = {**keys, **stated}.get("misalignment") is False
-            stated.setdefault("weights", "n" if aligned else "auto")
+            stated.setdefault("weights", weights_of_log({**keys, **stated}))
     return load_settings(config, stated)
 
 
@@ -209,22 +205,17 @@ def _check_output(output: str | None, format: str) -> None:
         raise UsageError(f"-o - prints the result file; leave out --format {format}")
     if output in (None, "-"):
         return
+    from accelcal_cli.calibration.result import RESULTS
     from accelcal_cli.output.files import is_stream
 
-    if Path(output).suffix not in SUFFIXES and not is_stream(output) and not Path(output).is_dir():
-        raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
+    if Path(output).suffix not in RESULTS and not is_stream(output) and not Path(output).is_dir():
+        raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(RESULTS)}')
 
 
 def _show(result: Calibration, format: str, output: str | None) -> None:
     """Write the result file, then print the result in the chosen form."""
     if output is not None:
-        from accelcal_cli.config import dump
-        from accelcal_cli.output.files import whole_file
-        from accelcal_cli.output.machine import json_text
-
-        text = json_text(result.record()) if output.endswith(".json") else dump(result.record())
-        with whole_file(output, binary=True) as file:  # read back as UTF-8, whatever the terminal takes
-            file.write(text.encode())
+        result.save(output)
         if output == "-":
             return
     from accelcal_cli.views.calibration import blocks, values

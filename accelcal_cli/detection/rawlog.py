@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -21,8 +21,12 @@ from accelcal_cli.io.columns import RawColumns, choose_raw, own_sensor_column, r
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, Selection, open_table
 from accelcal_cli.io.readings import InputForm
 from accelcal_cli.io.rows import MOST_SENSORS, SKIPPABLE, DeadColumns, OneSensor, RowBlock, ZeroRows
+from accelcal_cli.io.stream import Source
 from accelcal_cli.io.vocabulary import parse_unit
 from accelcal_cli.notices import Notice
+
+if TYPE_CHECKING:
+    import polars
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
@@ -35,7 +39,7 @@ CHANGES = 50
 
 
 def open_raw_log(
-    source: str | Path,
+    source: Source,
     columns: Sequence[str] | None = None,
     gyro: Sequence[str] | None = None,
     time: str | None = None,
@@ -46,7 +50,7 @@ def open_raw_log(
     """Open a raw log in any form that `read_readings` reads; ``-`` is standard input.
 
     Args:
-        source: path, or ``-``.
+        source: path, ``-``, or a frame.
         columns, gyro: three columns each, by name or by number from 1; found by their names when None; no
             gyroscope with `gyro` of ``["none"]``.
         time: a column, ``"none"``, or None to find it.
@@ -59,6 +63,21 @@ def open_raw_log(
     except BaseException:
         table.close()
         raise
+
+
+def read_log(source: Source, **how: Any) -> RawLog:
+    """Open a raw log to look at it, or to find its static poses with `detect`.
+
+    Args:
+        source: path, ``-``, or a frame; how: see `open_raw_log`.
+
+    Example:
+        >>> from accelcal_cli import read_log, simulate
+        >>> log = read_log(simulate("mems", positions=2, raw=True))
+        >>> round(log.clock.rate), log.to_frame().columns
+        (100, ['ax', 'ay', 'az', 't'])
+    """
+    return open_raw_log(source, **how)
 
 
 def sensors_of(
@@ -209,6 +228,16 @@ class RawLog:
                 last = float(numbers[-1, -1])
             yield numbers
         dead.check()
+
+    def to_frame(self) -> polars.DataFrame:
+        """Return the whole log as a frame of polars; the log is read by it, and cannot be read again."""
+        import polars
+
+        columns, names = self.columns, self._table.names
+        named = [*columns.output, *(columns.gyro or ())]
+        named += [k for k in (columns.temperature, columns.time) if k is not None]
+        keys = [str(k + 1) if names is None else names[k] for k in named]
+        return polars.DataFrame(np.concatenate(list(self.blocks())), schema=keys)
 
     def gyro_names(self) -> tuple[str, ...]:
         """Return the names of the gyroscope columns, or their numbers from 1; none without a gyroscope."""

@@ -1,7 +1,8 @@
-"""Parquet tables, read with polars; Parquet logs rewritten as Parquet or as text, and text logs as Parquet."""
+"""Parquet tables and frames in memory, read with polars; logs rewritten as Parquet, as text, or as a frame."""
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -55,15 +56,19 @@ class ParquetTable:
         self._files = ExitStack()
         try:
             self._path = path or self._copy()
-            with _named_errors(self.name):
-                frame = pl.scan_parquet(self._path)
-                schema = frame.collect_schema()
-                self.has_rows = bool(frame.head(1).collect().height)
+            self._take(pl.scan_parquet(self._path))
         except BaseException:
             self._files.close()
             raise
         if source.hashed:
             self._hashing.start(lambda: deque(source.rest(), maxlen=0))
+
+    def _take(self, frame: pl.LazyFrame) -> None:
+        """Take over the rows, and what the schema says of them."""
+        self._frame = frame
+        with _named_errors(self.name):
+            schema = frame.collect_schema()
+            self.has_rows = bool(frame.head(1).collect().height)
         self.names: tuple[str, ...] = tuple(schema)
         self.numeric = tuple(kind.is_numeric() for kind in schema.values())
 
@@ -79,7 +84,7 @@ class ParquetTable:
     def preview(self) -> list[list[str]]:
         """Return the cells of those of the first rows that are read."""
         with _named_errors(self.name):
-            frame = pl.scan_parquet(self._path).head(PREVIEW).collect()
+            frame = self._frame.head(PREVIEW).collect()
         rows = (["" if cell is None else str(cell) for cell in row] for row in frame.iter_rows())
         return [cells for cells in rows if self.filter is None or self.filter.meets(cells)]
 
@@ -100,7 +105,7 @@ class ParquetTable:
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
-        lazy, start, read = pl.scan_parquet(self._path).select(wanted or self.names), 0, 0
+        lazy, start, read = self._frame.select(wanted or self.names), 0, 0
         while not (frame := self._batch(lazy, read)).is_empty():
             read += frame.height
             frame = frame if self.filter is None else self.filter.rows(frame)
@@ -170,6 +175,59 @@ class ParquetTable:
         return f'{self.name}, {self.where(row)}, column "{self.names[column]}"'
 
 
+class FrameTable(ParquetTable):
+    """A frame in memory, read as the Parquet file that it could be written to."""
+
+    source_format = "frame"
+
+    def __init__(self, data: object) -> None:
+        """Take over a frame of polars, pandas or Arrow.
+
+        Raises:
+            DataError: a frame that polars does not understand.
+        """
+        self.name = "<frame>"
+        self.filter: RowFilter | None = None
+        self._whole = frame_of(data)
+        self._take(self._whole.lazy())
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the columns as an uncompressed Arrow file."""
+        return hashlib.sha256(self._whole.write_ipc(None).getbuffer()).hexdigest()
+
+    def close(self) -> None:
+        """Do nothing: the frame is the caller's."""
+
+
+def frame_of(data: object) -> pl.DataFrame:
+    """Return a frame of polars, pandas, Arrow or whatever speaks the Arrow stream protocol as one of polars.
+
+    Raises:
+        DataError: a frame that polars does not understand.
+    """
+    if isinstance(data, pl.DataFrame):
+        return data
+    if isinstance(data, pl.LazyFrame):
+        return data.collect()
+    try:
+        if type(data).__module__.startswith("pandas"):  # its own Arrow stream needs pyarrow
+            columns: Any = data
+            return pl.DataFrame([_series(str(name), columns[name].to_numpy()) for name in columns.columns])
+        return pl.DataFrame(data)  # type: ignore[arg-type]  # anything with __arrow_c_stream__
+    except (pl.exceptions.PolarsError, TypeError, ValueError) as problem:
+        reason = str(problem).strip().splitlines()[0][:200]
+        raise DataError(f"<frame>: cannot be read as a table ({reason})") from problem
+
+
+def _series(name: str, values: np.ndarray) -> pl.Series:
+    """Return a column of pandas; what it has no type for is text, or nothing where it is missing."""
+    if values.dtype != object:
+        return pl.Series(name, values)
+    missing = [value is None or value != value for value in values]
+    return pl.Series(name, [None if gone else str(v) for v, gone in zip(values, missing, strict=True)])
+
+
 def _row(row: int) -> str:
     return f"row {row + 1}"
 
@@ -200,6 +258,16 @@ def _changed(frame: pl.DataFrame, rows: RowBlock, change: Change) -> pl.DataFram
     values = np.ascontiguousarray(change.compute(rows.numbers).T)
     new = [pl.Series(name, column) for name, column in zip(change.names, values, strict=True)]
     return change.put(frame, new)
+
+
+def whole_frame(table: InputTable, change: Change) -> pl.DataFrame:
+    """Return the changed log in memory."""
+    if isinstance(table, ParquetTable):
+        return pl.concat(frames(table, change))
+    assert isinstance(table, TextTable)
+    cells = TextCells(table, change)
+    with tempfile.TemporaryDirectory(prefix="accelcal-") as folder:
+        return pl.concat(cells.typed(cells.keep(Path(folder))))
 
 
 def to_text(table: InputTable, change: Change, file: IO[bytes]) -> None:

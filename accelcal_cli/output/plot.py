@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, SCALE
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.detection.detect import Detection
 from accelcal_cli.navigation.study import BOUND, INS
 from accelcal_cli.output.files import whole_file
@@ -170,6 +172,65 @@ def _log(axes: Axes, detection: Detection) -> None:
             at, low[:, k], high[:, k], step="post", color=COLOURS[k], alpha=0.9, linewidth=0.6, label=label
         )
     axes.margins(x=0.01)
+
+
+def _axes(axes: Axes | None) -> Axes:
+    """Return axes to draw on: those given, or those of a new figure that notebooks show."""
+    if axes is not None:
+        return axes
+    from matplotlib import pyplot
+
+    _, new = pyplot.subplots(layout="constrained")
+    new.spines[["top", "right"]].set_visible(False)
+    return new
+
+
+def residuals(result: Calibration, axes: Axes | None = None) -> Axes:
+    """Draw |f| - g of every kept pose before and after calibration; poses are numbered from 1, as in tables."""
+    axes = _axes(axes)
+    poses = [fit.pose + 1 for fit in result.poses_fit]
+    for colour, label, values in (
+        (COLOURS[1], "before", [fit.residual_before for fit in result.poses_fit]),
+        (COLOURS[0], "after", [fit.residual for fit in result.poses_fit]),
+    ):
+        axes.plot(poses, values, "o", color=colour, markersize=4, label=label)
+    named = [fit for fit in result.poses_fit if fit.pose in result.outliers]
+    if named:
+        places = [fit.pose + 1 for fit in named], [fit.residual for fit in named]
+        axes.plot(*places, "X", color=COLOURS[6], markersize=8, label="outlier")
+    axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+    axes.set(xlabel="pose", ylabel=f"|f| - g [{result.unit}]")
+    axes.set_yscale("symlog", linthresh=max(result.s, 1e-12) if result.freedom > 0 else 1e-3)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    return axes
+
+
+def search(result: Calibration, axes: Axes | None = None) -> Axes:
+    """Draw the best cost so far against the evaluations, on logarithmic axes."""
+    axes = _axes(axes)
+    points = [(evaluations, cost) for evaluations, cost in result.convergence if cost > 0]
+    if points:
+        axes.plot(*zip(*points, strict=True), **line_style(0))
+        axes.set(xscale="log", yscale="log")
+    axes.set(xlabel="evaluations", ylabel=f"best cost L [({result.unit})^4]", title=result.optimizer)
+    return axes
+
+
+def intervals(result: Calibration, axes: Axes | None = None) -> Axes:
+    """Draw the nine parameters with their 95 % intervals, each divided by the largest of its kind."""
+    axes = _axes(axes)
+    values, sigma = result.engineering
+    half = result.interval_of(sigma)
+    for k, (name, part) in enumerate((("scale", SCALE), ("misalignment", MISALIGNMENT), ("bias", BIAS))):
+        largest = float(np.abs(values[part]).max()) or 1.0
+        at = np.arange(3) + 4 * k
+        spread = np.nan_to_num(half[part]) / largest
+        axes.errorbar(at, values[part] / largest, spread, color=COLOURS[k], capsize=3, fmt="o", label=name)
+    axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+    axes.set_xticks([k for k in range(11) if k % 4 < 3], ["x", "y", "z", "xy", "xz", "yz", "x", "y", "z"])
+    axes.set(ylabel="value / largest of its kind")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    return axes
 
 
 HOUR = 3600.0

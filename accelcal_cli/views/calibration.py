@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -242,6 +243,15 @@ def worst_poses(result: Calibration) -> Table:
         Column(""),
     )
     return Table("Worst poses", columns, rows)
+
+
+def numbers(result: Calibration) -> Table:
+    """Return one row per parameter and number, for frames; one that is not determined has no value."""
+    whole = values(result)
+    columns = tuple(
+        replace(column, format="g") if 0 < k < 4 else column for k, column in enumerate(whole.columns)
+    )
+    return Table(whole.title, columns, tuple(row for row in whole.rows if row[0] != "verdict"))
 
 
 def values(result: Calibration) -> Table:
