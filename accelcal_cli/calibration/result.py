@@ -44,11 +44,13 @@ if TYPE_CHECKING:
 NEAR_G = 0.02
 """Local gravity is within this part of 9.80665 m/s^2, anywhere."""
 
-SCHEMA = "accelcal/calibration/2"
-"""Name and version of the record; a reader refuses what it does not know."""
+SCHEMA = "accelcal/calibration/3"
+"""Name and version of the record; a reader refuses what it does not know.
 
-OLDER = "accelcal/calibration/1"
-"""The version before it, which is read, too: see `_of_older`."""
+Its poses are numbered from 1, as in tables and pictures; in memory they are numbered from 0."""
+
+OLDER, FROM_ZERO = "accelcal/calibration/1", "accelcal/calibration/2"
+"""The versions before it, which are read, too: see `_of_older`; the second numbered poses from 0."""
 
 RESULTS = (".yaml", ".yml", ".json")
 """Endings of a result file; they choose its form."""
@@ -444,7 +446,7 @@ class Calibration:
             key: {kind: column[part] for kind, column in zip(ENGINEERING, columns, strict=True)}
             for key, part in (("scale_error", SCALE), ("misalignment", MISALIGNMENT), ("bias", BIAS))
         }
-        return {**to_mapping(self), "engineering": to_mapping(view)}
+        return {**_renumbered(to_mapping(self), 1), "engineering": to_mapping(view)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any], where: str) -> Calibration:
@@ -456,7 +458,11 @@ class Calibration:
         older = record.get("schema") == OLDER
         if older:
             record = _of_older(record)
-        if record.get("schema") != SCHEMA:
+        elif record.get("schema") == FROM_ZERO:
+            record = {**record, "schema": SCHEMA}
+        elif record.get("schema") == SCHEMA:
+            record = _renumbered(record, -1)
+        else:
             raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
         place = f"{where}: not a calibration result"
         try:
@@ -472,6 +478,22 @@ class Calibration:
             return result
         freedom = result.freedom
         return result.with_intervals(student_quantile(0.975, freedom) if freedom > 0 else math.nan)
+
+
+def _renumbered(record: Mapping[str, Any], by: int) -> dict[str, Any]:
+    """Return a record with the numbers of its poses moved; what is no number stays, for the reader to refuse."""
+    new, fits, outliers = dict(record), record.get("poses_fit"), record.get("outliers")
+    if isinstance(fits, list):
+        new["poses_fit"] = [
+            {**fit, "pose": _moved(fit.get("pose"), by)} if isinstance(fit, Mapping) else fit for fit in fits
+        ]
+    if isinstance(outliers, list):
+        new["outliers"] = [_moved(pose, by) for pose in outliers]
+    return new
+
+
+def _moved(pose: object, by: int) -> object:
+    return pose + by if isinstance(pose, int) and not isinstance(pose, bool) else pose
 
 
 AGAIN = "Calibrate the readings again."

@@ -16,6 +16,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -171,6 +172,9 @@ Format = Annotated[
         autocompletion=one_of(FORMATS),
         callback=_check_format,
     ),
+]
+Verbose = Annotated[
+    bool, in_output("--verbose", "-v", help="Print all there is: more than one screen of a terminal.")
 ]
 Quiet = Annotated[bool, in_output("--quiet", "-q", help="Print nothing on standard error but errors.")]
 
@@ -544,9 +548,14 @@ def print_result(
 
 
 def tell(notes: Iterable[str], quiet: bool = False) -> None:
-    """Say something on standard error, a line each, unless quiet."""
+    """Say something on standard error, a line each, unless quiet; on a terminal in lines that fit."""
     for note in () if quiet else notes:
-        typer.echo(visible(f"accelcal: {note}"), err=True)
+        text = visible(f"accelcal: {note}")
+        if sys.stderr.isatty():
+            from accelcal_cli.views.blocks import wrapped
+
+            text = wrapped(text, get_terminal_size().columns, "", "  ")
+        typer.echo(text, err=True)
 
 
 def tell_written(paths: Iterable[str | None], quiet: bool) -> None:

@@ -68,12 +68,13 @@ def command(
         in_plan(help="Noise of one pose, one sigma, m/s^2.", show_default="s of the poses so far"),
     ] = None,
     format: options.Format = "table",
+    verbose: options.Verbose = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Plan the next poses: those that shrink the worst sigma.
 
-    Prints them in words and as vectors, and the sigma to expect after each. Exit code 1 means that not even all
-    these poses determine the parameters.
+    Prints them in words, and the sigma to expect after each; with --verbose also as vectors. Exit code 1 means that
+    not even all these poses determine the parameters.
     """
     from accelcal_cli.planning import plan
     from accelcal_cli.views import plan as views
@@ -90,7 +91,7 @@ def command(
         options.print_result(
             format,
             partial(views.pose_table, proposal),
-            partial(views.blocks, proposal),
+            partial(views.blocks, proposal, verbose),
             partial(views.record, proposal),
         )
     with process.even_if_unread(sys.stderr):

@@ -133,7 +133,7 @@ def test_a_record_carries_its_units_and_origin():
 @pytest.mark.parametrize("schema", [None, "accelcal/calibration/3", "other", 1])
 def test_another_schema_is_refused(schema):
     record = {**_result("good").record(), "schema": schema}
-    with pytest.raises(DataError, match=r"old.yaml: schema is .*expected \"accelcal/calibration/2\""):
+    with pytest.raises(DataError, match=r"old.yaml: schema is .*expected \"accelcal/calibration/3\""):
         Calibration.from_record(record, "old.yaml")
 
 

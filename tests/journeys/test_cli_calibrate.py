@@ -72,7 +72,7 @@ def truth(run, *arguments):
 
 def test_json_keeps_its_contract(run, good):
     result = record(run, good)
-    assert result["schema"] == SCHEMA == "accelcal/calibration/2"
+    assert result["schema"] == SCHEMA == "accelcal/calibration/3"
     assert set(CONTRACT) <= set(result)
     for name, expected in CONTRACT.items():
         if isinstance(expected, tuple) and isinstance(expected[0], int):
