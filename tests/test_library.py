@@ -244,6 +244,7 @@ def test_a_fleet_is_calibrated_from_a_table_or_by_label():
         (5.0, 0.0, ("5", "")),
         (5.0, float("nan"), ("5", "")),
         (1e-20, 1e-22, ("1e-20", "1.0e-22")),
+        (1234.56789012, 1e-10, ("1234.56789", "1.0e-10")),
     ],
 )
 def test_values_are_quoted_to_two_digits_of_their_uncertainty(value, interval, quoted):

@@ -21,6 +21,9 @@ PLUS_MINUS = "±"
 QUOTED = f"value {PLUS_MINUS} 95 %"
 """Heading of values with the half-width of their 95 % interval."""
 
+FINEST = 1e7
+"""A value of so many times its uncertainty is exact to all digits that one reads."""
+
 MOST_NOTES = 4
 """Sentences of verdict and warnings that the text of a calibration holds: it has fifteen lines at most."""
 
@@ -40,8 +43,8 @@ def quote(value: float, interval: float) -> tuple[str, str]:
     digits = 1 - math.floor(math.log10(interval))
     if round(interval, digits) >= 10 ** (2 - digits):  # 0.0996 is 0.10, not 0.100
         digits -= 1
-    if not -15 < digits < 15:
-        return f"{value:.6g}", f"{interval:.1e}"
+    if abs(value) > FINEST * interval or not -15 < digits < 15:
+        return f"{value:.9g}", f"{interval:.1e}"
     shown = max(digits, 0)
     return f"{round(value, digits) + 0.0:.{shown}f}", f"{round(interval, digits):.{shown}f}"
 
