@@ -20,7 +20,10 @@ screening, weights, ...) and the texts that devices write (clock, lines, vocabul
 
 FLOW = {
     # files and pairs of files; 61 and 101 in the first version, 36 and 61 in the new house
-    "calibrate": (42, 79),  # 36 and 61; the library takes what the command line takes, and results print themselves
+    "calibrate": (
+        42,
+        79,
+    ),  # 36 and 61; the library takes what the command line takes, and results print themselves
     "detect": (42, 61),  # 58 and 89; 35 and 52
     "fleet": (41, 67),  # 56 and 69; 34 and 46
     "benchmark": (28, 64),  # 59 and 64; 26 and 59

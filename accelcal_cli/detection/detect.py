@@ -103,6 +103,7 @@ class Detection:
         envelope: of the log, for a picture; None unless asked for.
         warnings: what the rows show that is no rest.
         behind: the first rows of acceleration and the extremes of all, sensor units; None where they are not known.
+        time_unit: of the times of the poses; began: date and time of the first row, None where they are not known.
     """
 
     source: str
@@ -121,6 +122,8 @@ class Detection:
     envelope: Envelope | None = None
     warnings: tuple[Notice, ...] = ()
     behind: Behind | None = None
+    time_unit: str = "s"
+    began: np.datetime64 | None = None
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
@@ -262,6 +265,8 @@ def _detected(log: RawLog, settings: DetectSettings, picture: bool) -> Detection
         warnings=warnings,
         envelope=envelope,
         behind=Behind(head, tiles.low, tiles.high),
+        time_unit=log.clock.unit,
+        began=log.began,
     )
     if not enough:
         why = explain_too_few(segmentations[kept], candidates[kept], detection)

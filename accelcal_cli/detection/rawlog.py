@@ -16,7 +16,15 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.clock import UNITS, Clock, SoundTimes, seconds_of_dates, unit_of, wrong_time
+from accelcal_cli.io.clock import (
+    UNITS,
+    Clock,
+    SoundTimes,
+    StampReader,
+    seconds_of_dates,
+    unit_of,
+    wrong_time,
+)
 from accelcal_cli.io.columns import RawColumns, choose_raw, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, Selection, open_table
 from accelcal_cli.io.readings import InputForm
@@ -125,9 +133,11 @@ class RawLog:
         self.zeros = ZeroRows()
         self._table = table
         dated = columns.dated
+        self._stamps: StampReader | None = None
         rows = _of_one(table.blocks(columns.selection()), OneSensor(table, columns.identity, fleet=False))
         if dated:
-            rows = seconds_of_dates(rows, self._time_at, table.facts.day_first, lenient=table.lenient)
+            self._stamps = StampReader(self._time_at, table.facts.day_first, table.lenient)
+            rows = seconds_of_dates(rows, self._stamps)
         self._sound = None
         if table.lenient and columns.time is not None and not columns.guessed:
             self._sound = SoundTimes(table)
@@ -187,6 +197,11 @@ class RawLog:
         names, time = self._table.names, self.columns.time or 0
         column = str(time + 1) if names is None else f'"{names[time]}"'
         return f"{self.name}, {self._table.where(row)}, column {column}"
+
+    @property
+    def began(self) -> np.datetime64 | None:
+        """Date and time of the first row, where the time column has dates."""
+        return None if self._stamps is None else self._stamps.began
 
     @property
     def form(self) -> InputForm:

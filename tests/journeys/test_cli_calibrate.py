@@ -151,7 +151,15 @@ def test_the_table_says_it_all(run, good):
     outcome, whole = run("calibrate", good), run("calibrate", good, "--verbose")
     for part in ("Verdict: good", "Calibration", "Engineering view", "Fit"):
         assert part in outcome.out
-    for part in ("Verdict: good", "Calibration", "Engineering view", "Fit", "Observability", "Poses", "Convergence"):
+    for part in (
+        "Verdict: good",
+        "Calibration",
+        "Engineering view",
+        "Fit",
+        "Observability",
+        "Poses",
+        "Convergence",
+    ):
         assert part in whole.out
     assert "gauge lower" in outcome.out
     assert "g = 9.80665 assumed" in outcome.err
