@@ -79,9 +79,9 @@ class Browser:
         messages = [json.loads(entry["message"])["message"] for entry in self.log("performance")]
         return [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
 
-    def screenshot(self, file: Path) -> None:
-        """Write a picture of the whole page."""
-        answer = self.devtools("Page.captureScreenshot", captureBeyondViewport=True, format="png")
+    def screenshot(self, file: Path, *, whole: bool = True) -> None:
+        """Write a picture of the whole page, or of what the window shows."""
+        answer = self.devtools("Page.captureScreenshot", captureBeyondViewport=whole, format="png")
         file.write_bytes(base64.b64decode(answer["data"]))
 
     def print(self, file: Path) -> None:

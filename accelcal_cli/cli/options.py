@@ -488,7 +488,7 @@ def check_plot(plot: str | None) -> None:
 
     check_suffix("--plot", plot, PLOT_SUFFIXES)
     if find_spec("matplotlib") is None:
-        raise UsageError("--plot needs matplotlib: pip install 'accelcal[plot]'")
+        raise UsageError("--plot needs matplotlib: python -m pip install matplotlib")
 
 
 def split_columns(text: str | None) -> list[str] | None:

@@ -39,7 +39,7 @@ RAISED = (("m/s^2", "m/s\u00b2"), (")^4", ")\u2074"), ("(g)\u2074", "g\u2074"))
 def check_packages() -> None:
     """Raise UsageError when a package that only reports need is missing."""
     if any(importlib.util.find_spec(name) is None for name in NEEDS):
-        raise UsageError("a report needs jinja2 and matplotlib: pip install 'accelcal[report]'")
+        raise UsageError("a report needs jinja2 and matplotlib: python -m pip install jinja2 matplotlib")
 
 
 def report(

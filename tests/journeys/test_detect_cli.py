@@ -255,7 +255,7 @@ def test_a_picture_needs_matplotlib(run, log, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     outcome = run("detect", log, "--plot", "log.png")
     assert outcome.code == 2
-    assert "pip install 'accelcal[plot]'" in outcome.err
+    assert "python -m pip install matplotlib" in outcome.err
 
 
 def test_options_of_a_log_go_with_raw(run, log):
