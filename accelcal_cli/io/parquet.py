@@ -1,11 +1,10 @@
-"""Parquet tables, read with polars; Parquet logs rewritten as Parquet or as text, and text logs as Parquet."""
+"""Parquet tables, read with polars; Parquet and native logs rewritten as Parquet or as text, text logs as Parquet."""
 
 from __future__ import annotations
 
 import tempfile
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -14,10 +13,11 @@ import numpy as np
 import polars as pl
 
 from accelcal_cli.errors import DataError
+from accelcal_cli.io.formats.base import NativeTable, RandomAccess, no_room
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection, TextTable
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.rows import RowBlock, RowFilter
-from accelcal_cli.io.stream import BackgroundThread, ByteSource
+from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.io.vocabulary import Facts
 
 ROWS = 500_000
@@ -51,26 +51,23 @@ class ParquetTable:
         self.name = source.name
         self.filter: RowFilter | None = None
         self._source = source
-        self._hashing = BackgroundThread()
-        self._files = ExitStack()
+        self._file = RandomAccess(source, path, ".parquet")
+        self._path = self._file.path
         try:
-            self._path = path or self._copy()
             with _named_errors(self.name):
                 frame = pl.scan_parquet(self._path)
                 schema = frame.collect_schema()
                 self.has_rows = bool(frame.head(1).collect().height)
         except BaseException:
-            self._files.close()
+            self._file.close()
             raise
-        if source.hashed:
-            self._hashing.start(lambda: deque(source.rest(), maxlen=0))
         self.names: tuple[str, ...] = tuple(schema)
         self.numeric = tuple(kind.is_numeric() for kind in schema.values())
 
     @property
     def sha256(self) -> str:
         """SHA-256 of the file."""
-        self._hashing.wait()
+        self._file.wait()
         return self._source.sha256
 
     def leave_out(self, row: int) -> None:
@@ -125,22 +122,8 @@ class ParquetTable:
 
     def close(self) -> None:
         """Remove the copy and close the file."""
-        self._source.stop()
-        self._hashing.wait()
+        self._file.close()
         self._source.close()
-        self._files.close()
-
-    def _copy(self) -> Path:
-        try:
-            copy = tempfile.NamedTemporaryFile(prefix="accelcal-", suffix=".parquet")  # noqa: SIM115
-            self._files.enter_context(copy)
-            copy.write(self._source.head)
-            for block in self._source.rest():
-                copy.write(block)
-            copy.flush()
-        except OSError as problem:
-            raise no_room(self.name, problem) from problem
-        return Path(copy.name)
 
     def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
         with _named_errors(self.name):
@@ -174,11 +157,6 @@ def _row(row: int) -> str:
     return f"row {row + 1}"
 
 
-def no_room(name: str, problem: OSError) -> DataError:
-    """Return what to raise where a working copy of an input cannot be written."""
-    return DataError(f"{name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})")
-
-
 @contextmanager
 def _named_errors(name: str) -> Iterator[None]:
     """Raise what polars finds wrong with a file as DataError; a panic of its decoder is no subclass of its errors."""
@@ -191,7 +169,7 @@ def _named_errors(name: str) -> Iterator[None]:
 
 def frames(table: InputTable, change: Change) -> Iterator[pl.DataFrame]:
     """Yield the changed log, block after block."""
-    assert isinstance(table, ParquetTable)
+    assert isinstance(table, ParquetTable | NativeTable)
     for frame, rows in table.pairs(change.selection):
         yield _changed(frame, rows, change)
 
@@ -217,7 +195,7 @@ def to_parquet(table: InputTable, change: Change, file: IO[bytes]) -> None:
         OSError: it cannot be written.
     """
     target = file.name if isinstance(file.name, str) else file  # an open descriptor has a number for a name
-    if isinstance(table, ParquetTable):
+    if isinstance(table, ParquetTable | NativeTable):
         with system_errors():
             _sink(frames(table, change), target)
         return

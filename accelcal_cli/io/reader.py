@@ -63,6 +63,7 @@ class ReadOptions:
         line: what the lines of readings begin with, among lines of several kinds; None to find them by their words.
         count: the column of counts, or ``none``; None to find it by its name.
         where: conditions that the rows to read meet, each as COLUMN=VALUE.
+        accelerometer: the one to read of a log that has several, by the name that the log gives it.
     """
 
     skip_rows: int = 0
@@ -70,6 +71,7 @@ class ReadOptions:
     line: str | None = None
     count: str | None = None
     where: tuple[str, ...] = ()
+    accelerometer: str | None = None
 
 
 PLAIN = ReadOptions()
@@ -120,7 +122,7 @@ class InputTable(Protocol):
 
     @property
     def source_format(self) -> str:
-        """How the input is written: ``csv``, whatever separates its columns, or ``parquet``."""
+        """How the input is written: ``csv``, whatever separates its columns, ``parquet``, or a native format's name."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -172,6 +174,10 @@ def open_table(
             from accelcal_cli.io.parquet import ParquetTable
 
             return ParquetTable(stream, None if stream.forms else path)
+        if stream.native is not None:
+            from accelcal_cli.io.formats.base import NativeTable
+
+            return NativeTable(stream, None if stream.forms else path, options)
         return TextTable(stream, options)
     except BaseException:
         stream.close()
