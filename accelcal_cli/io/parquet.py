@@ -42,6 +42,7 @@ class ParquetTable:
     units: tuple[str, ...] | None = None
     facts = Facts()
     source_format = "parquet"
+    correction = None
     notes: tuple[str, ...] = ()
     rows_skipped = 0
     lenient = False  # its cells have types: none is broken
