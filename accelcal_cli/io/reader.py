@@ -33,7 +33,7 @@ from accelcal_cli.io.dialect import (
     understand,
 )
 from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
-from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
+from accelcal_cli.io.stream import LONGEST_LINE, TYPED, ByteSource, open_source
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
 
@@ -174,10 +174,10 @@ def open_table(
     """Open a table of any supported form; ``-`` is standard input. Without the hash it is read a little faster."""
     stream, path = open_source(source, stdin, hashed=hashed), None if str(source) == "-" else Path(source)
     try:
-        if stream.head.startswith(b"PAR1") or (path and path.suffix.lower() in {".parquet", ".pq"}):
-            from accelcal_cli.io.parquet import ParquetTable
+        if stream.head.startswith(TYPED) or (path and path.suffix.lower() in {".parquet", ".pq"}):
+            from accelcal_cli.io.parquet import open_typed
 
-            return ParquetTable(stream, None if stream.forms else path)
+            return open_typed(stream, None if stream.forms else path, options.accelerometer)
         if stream.native is not None:
             from accelcal_cli.io.formats.base import NativeTable
 
