@@ -176,7 +176,9 @@ class MessageFilter:
         rows = [line[len(lead) :].lstrip() if line.startswith(lead) else b"" for line in lines]
         if self.instance is not None:
             at, own = self.columns.index("I"), b"%d" % self.instance
-            rows = [row if row and row.split(b",", at + 1)[at : at + 1] == [own] else b"" for row in rows]
+            cells = (row.split(b",", at + 1) for row in rows)
+            met = [len(cell) > at and cell[at].strip() == own for cell in cells]
+            rows = [row if is_own else b"" for row, is_own in zip(rows, met, strict=True)]
         return b"\n".join(rows)
 
     def notes(self) -> tuple[str, ...]:

@@ -166,20 +166,25 @@ class ParquetTable(FrameTable):
     """A Parquet file, streamed a batch of rows at a time."""
 
     source_format = "parquet"
+    form = "Parquet"
 
     def __init__(self, source: ByteSource, path: Path | None) -> None:
         """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
         super().__init__(source)
-        self._file = RandomAccess(source, path, ".parquet")
+        self._file = RandomAccess(source, path, f".{self.source_format}")
         self._path = self._file.path
         try:
-            with _named_errors(self.name, "Parquet"):
-                frame = pl.scan_parquet(self._path)
+            with _named_errors(self.name, self.form):
+                frame = self._scan(self._path)
                 self._take(frame.collect_schema())
                 self.has_rows = bool(frame.head(1).collect().height)
         except BaseException:
             self._file.close()
             raise
+
+    @staticmethod
+    def _scan(path: Path) -> pl.LazyFrame:
+        return pl.scan_parquet(path)
 
     @property
     def sha256(self) -> str:
@@ -188,17 +193,17 @@ class ParquetTable(FrameTable):
         return self._source.sha256
 
     def _head(self) -> pl.DataFrame:
-        with _named_errors(self.name, "Parquet"):
-            return pl.scan_parquet(self._path).head(PREVIEW).collect()
+        with _named_errors(self.name, self.form):
+            return self._scan(self._path).head(PREVIEW).collect()
 
     def _batches(self, wanted: Sequence[str]) -> Iterator[pl.DataFrame]:
-        lazy, read = pl.scan_parquet(self._path).select(wanted), 0
+        lazy, read = self._scan(self._path).select(wanted), 0
         while not (frame := self._batch(lazy, read)).is_empty():
             read += frame.height
             yield frame
 
     def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
-        with _named_errors(self.name, "Parquet"):
+        with _named_errors(self.name, self.form):
             return lazy.slice(start, ROWS).collect()
 
     def close(self) -> None:
@@ -207,11 +212,22 @@ class ParquetTable(FrameTable):
         super().close()
 
 
-class ArrowTable(FrameTable):
-    """A table in Arrow IPC, as a file or as a stream, a record batch at a time.
+class ArrowTable(ParquetTable):
+    """A file of Arrow IPC, whose schema is at its end, too."""
 
-    A file is a stream between two marks, so that both are read alike, from top to bottom: each record batch is given to
-    polars behind the schema and the dictionaries (arrow.apache.org, Serialization and Interprocess Communication).
+    source_format = "arrow"
+    form = "Arrow"
+
+    @staticmethod
+    def _scan(path: Path) -> pl.LazyFrame:
+        return pl.scan_ipc(path)
+
+
+class ArrowStream(FrameTable):
+    """A stream of Arrow IPC, a record batch at a time.
+
+    Each record batch is given to polars behind the schema and the dictionaries (arrow.apache.org, Serialization and
+    Interprocess Communication): polars itself reads a whole stream into memory.
     """
 
     source_format = "arrow"
@@ -253,14 +269,11 @@ class ArrowTable(FrameTable):
 
 
 class ArrowMessages:
-    """The messages of Arrow IPC in blocks of bytes: kind, and the message with its body."""
+    """The messages of an Arrow stream in blocks of bytes: kind, and the message with its body."""
 
     def __init__(self, blocks: Iterable[bytes]) -> None:
-        """Take over the bytes, the mark of a file included if there is one."""
+        """Take over the bytes."""
         self._blocks, self._rest = iter(blocks), b""
-        if not self._peek(8).startswith(ARROW_FILE):
-            return
-        self._next(8)
 
     def __iter__(self) -> Iterator[tuple[int, bytes]]:
         """Return itself."""
@@ -311,8 +324,9 @@ def open_typed(source: ByteSource, path: Path | None, accelerometer: str | None 
         raise UsageError(
             f'--accelerometer "{accelerometer}": {source.name} is a table; use --columns or --where'
         )
-    arrow = source.head.startswith((ARROW_FILE, ARROW_STREAM))
-    return ArrowTable(source) if arrow else ParquetTable(source, path)
+    if source.head.startswith(ARROW_STREAM):
+        return ArrowStream(source)
+    return (ArrowTable if source.head.startswith(ARROW_FILE) else ParquetTable)(source, path)
 
 
 def _row(row: int) -> str:

@@ -132,7 +132,7 @@ class _UlogScanner:
         topics, end = self.topics, len(data)
         for topic in topics.values():
             topic.rows.clear()
-        at = self._next_message(data, 0) if self._lost_way else 0
+        at, last = self._next_message(data, 0) if self._lost_way else 0, None
         while at + 5 <= end and not self._lost_way:
             size, kind = data[at] | data[at + 1] << 8, data[at + 2]
             stop = at + 3 + size
@@ -147,7 +147,11 @@ class _UlogScanner:
                 row.rows.append(at + 5)
             elif sound:
                 sound = self._take(kind, data[at + 3 : stop])
-            at = stop if sound else self._next_message(data, at + 1)
+            if not sound:
+                if last is not None:  # a row that no message follows is damaged, too
+                    last.rows.pop()
+                row, stop = None, self._next_message(data, at + 1)
+            at, last = stop, row
         return at
 
     def _next_message(self, data: bytes, start: int) -> int:
@@ -199,7 +203,9 @@ class _UlogScanner:
             number = int(count.rstrip("]") or 1)
             if kind in NUMPY:
                 places[label] = _Place(end, NUMPY[kind], number)
-            elif depth < DEEPEST:
+            elif depth >= DEEPEST:
+                raise ValueError(name)
+            else:
                 places[label] = _Place(end, "<u1", self._layout(kind, depth + 1)[1] * number)
             end = places[label].end
             if not 0 < end < LARGEST:
