@@ -98,7 +98,7 @@ def test_a_fleet_of_native_logs(run, held):
     assert outcome.code == 0, outcome.err
     write_flash(Path("a.BIN"), {0: held, 1: held}, {})
     outcome = run("fleet", "a.BIN", "--raw", "--gyro", "none", "--format", "json", "-q")
-    assert (outcome.code, "has several accelerometers (IMU[0], IMU[1])" in outcome.out) == (1, True)
+    assert (outcome.code, "Has several accelerometers (IMU[0], IMU[1])" in outcome.out) == (1, True)
     more = ("--accelerometer", "IMU[1]", "--format", "json", "-q")
     assert run("fleet", "a.BIN", "--raw", "--gyro", "none", *more).code == 0
 
