@@ -59,6 +59,7 @@ def command(
             autocompletion=options.several_of(options.optimizers_or_all),
         ),
     ] = None,
+    preset: options.Preset = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
@@ -95,7 +96,7 @@ def command(
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
     named = words(optimizer or ())
     budget = Budget(population, iterations, evaluations)
-    entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget)
+    entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset)
     study = Benchmark(
         select(words(func or ())),
         tuple(entries), dim, runs, seed, tolerance, evaluations, stop, shift, rotate,

@@ -86,6 +86,7 @@ class SearchOptions:
             autocompletion=options.one_of(options.optimizers),
         ),
     ] = None
+    preset: options.Preset = None
     population: Annotated[int | None, in_search(help="Points of the search.")] = None
     iterations: Annotated[int | None, in_search(help="Iterations of the search.")] = None
     runs: Annotated[int | None, in_search(help="Independent searches (multi-start).")] = None

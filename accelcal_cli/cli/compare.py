@@ -109,6 +109,7 @@ def command(
             autocompletion=options.several_of(options.optimizers_or_all),
         ),
     ] = None,
+    preset: options.Preset = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
@@ -163,7 +164,7 @@ def command(
             "(errors are always those of gauge lower)"
         )
     space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, UNKNOWNS[gauge])
-    entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
+    entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations), preset)
     source: Simulation | Recording
     if data is not None:
         source = _recorded(data, columns, form, space.g, simulation)

@@ -7,7 +7,8 @@ import typing
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, shipped_parameters
+from accelcal_cli.config import load_mapping
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, optimizer_file, shipped_parameters
 from accelcal_cli.studies.benchmark import LEVEL, Benchmark, Ranking, statistics
 from accelcal_cli.studies.study import Curves, Record, Row, Study
 from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table, convergence
@@ -191,7 +192,17 @@ def optimizer_settings(name: str) -> Table:
     ]
     columns = (Column("parameter"), Column("default"), Column("range"), Column("meaning"))
     title = f"{name}: {cls.family}, [{cls.paper}]. {_sentence(cls)}"
-    return Table(title, columns, tuple(rows))
+    return Table(title, columns, tuple(rows), tuple(_presets(name)))
+
+
+def _presets(name: str) -> list[str]:
+    """Return a sentence for each preset of an optimizer: what it sets; none where the file has none."""
+    path = optimizer_file(name)
+    presets = load_mapping(path).get("presets", {}) if path else {}
+    return [
+        f"--preset {key}: {assignments(values) if values else 'the defaults'}"
+        for key, values in presets.items()
+    ]
 
 
 def _sentence(cls: type) -> str:
@@ -229,7 +240,7 @@ def optimizer_settings_blocks(table: Table) -> list[Block]:
     for name, default, values, meaning in table.rows:
         limits = f"  ({values})" if values else ""
         blocks += [Paragraph(f" = {plain(default)}{limits}", heading=name), Paragraph(meaning, indent=2)]
-    return blocks
+    return [*blocks, *([BLANK] if table.notes else []), *map(Paragraph, table.notes)]
 
 
 def assignments(parameters: Mapping[str, Any]) -> str:
