@@ -59,7 +59,7 @@ def command(
             autocompletion=options.several_of(options.optimizers_or_all),
         ),
     ] = None,
-    preset: options.Preset = None,
+    preset: running.Preset = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)

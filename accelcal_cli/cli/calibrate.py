@@ -23,6 +23,7 @@ SUFFIXES = (".yaml", ".yml", ".json")
 
 ROBUST = ("none", "huber", "soft-l1")
 ATTITUDES = ("unknown", "known")
+PRESETS = ("printed", "tuned")
 
 in_model, in_search = options.panel("Model"), options.panel("Search")
 
@@ -86,7 +87,14 @@ class SearchOptions:
             autocompletion=options.one_of(options.optimizers),
         ),
     ] = None
-    preset: options.Preset = None
+    preset: Annotated[
+        str | None,
+        in_search(
+            help="Settings of the optimizer beneath those that are stated: {choices}.",
+            show_default="its defaults",
+            autocompletion=options.one_of(PRESETS),
+        ),
+    ] = None
     population: Annotated[int | None, in_search(help="Points of the search.")] = None
     iterations: Annotated[int | None, in_search(help="Iterations of the search.")] = None
     runs: Annotated[int | None, in_search(help="Independent searches (multi-start).")] = None

@@ -111,7 +111,6 @@ SCHEMES = ("faces", "edges", "faces-edges", "icosahedron", "turns", "fibonacci",
 GAUGES = ("lower", "upper", "symmetric", "full")
 WEIGHTS = ("none", "n", "sd", "auto")
 UNITS = ("m/s^2", "g", "mg")
-PRESETS = ("printed", "tuned")
 FIXTURES = ("faces", "edges", "corners", "any")
 """Names of the library, stated again so that help need not import it; tests compare them."""
 
@@ -161,15 +160,6 @@ ResultFile = Annotated[
 Columns = Annotated[
     str | None,
     in_input("--columns", help="The three output columns: names, or numbers from 1, separated by commas."),
-]
-Preset = Annotated[
-    str | None,
-    panel("Search")(
-        "--preset",
-        help="Settings of the optimizer beneath those that are stated: {choices}.",
-        show_default="the optimizer's defaults",
-        autocompletion=one_of(PRESETS),
-    ),
 ]
 Force = Annotated[bool, in_input("--force", help="Use a result although its verdict is undetermined.")]
 Format = Annotated[

@@ -30,6 +30,18 @@ Plot = Annotated[
     str | None,
     options.in_output("--plot", help="Draw convergence to a .png or .svg file.", metavar="FILE"),
 ]
+PRESETS = ("printed", "tuned")
+"""Names of optimization.optimizer, stated again so that help need not import it; a test compares them."""
+
+Preset = Annotated[
+    str | None,
+    options.panel("Search")(
+        "--preset",
+        help="Settings of the optimizers beneath those that are stated: {choices}.",
+        show_default="each optimizer's defaults",
+        autocompletion=options.one_of(PRESETS),
+    ),
+]
 
 
 @dataclass(frozen=True)

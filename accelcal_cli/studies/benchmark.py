@@ -27,6 +27,7 @@ from accelcal_cli.studies.study import (
     Task,
     records_of,
     records_of_cell,
+    spread,
 )
 
 NEEDS = {"residuals": "residuals (a sum of squares)", "closed_form": "a closed form"}
@@ -98,7 +99,8 @@ class Benchmark(Study):
         runs = range(task.first, task.last)
         start = time.thread_time()
         run = minimize(problem, optimizer, runs=runs, seed=self.seed, stopping=stopping)
-        return records_of(task, run, self.tolerance, time.thread_time() - start)
+        records = records_of(task, run, self.tolerance, time.thread_time() - start)
+        return [replace(r, point=tuple(x)) for r, x in zip(records, run.x.tolist(), strict=True)]
 
     def suiting(self, named: Sequence[str]) -> tuple[Benchmark, list[str]]:
         """Return the study without optimizers that suit no function, and a sentence for everything left out.
@@ -135,7 +137,7 @@ def statistics(study: Benchmark, records: Sequence[Record]) -> list[Row]:
 
     Definition:
         evaluations, seconds: medians; evaluations_to_tolerance: median of the runs that reached the tolerance.
-        min, max, mean, variance, median: of the cost; a run without any finite cost counts as infinite.
+        min, max, mean, variance, median, quartiles: of the cost; a run without any finite cost counts as infinite.
         failures: number of runs with a numerical failure.
     """
     by_cell = [(study.names(cell), records_of_cell(records, cell)) for cell in range(study.cells)]
@@ -149,11 +151,9 @@ def _statistics(records: Sequence[Record]) -> Row:
     return {
         "runs": len(records),
         "evaluations": int(np.median([r.evaluations for r in records])),
-        "min": float(cost.min()),
-        "max": float(cost.max()),
+        **spread(cost),
         "mean": float(cost.mean()),
         "variance": float(cost.var(ddof=1)) if several else None,
-        "median": float(np.median(cost)),
         "success_rate": len(hits) / len(records),
         "evaluations_to_tolerance": int(np.median(hits)) if hits else None,
         "failures": sum(r.status == Status.FAILED.name.lower() for r in records),

@@ -218,6 +218,7 @@ class Record:
         values: further results of the kind of study (parameter errors, ...), by name.
         curve: points of evaluations and best cost so far, thinned; none beyond the first CURVES runs.
         seconds: time of the run: its share of the time of its block.
+        point: best point of a test function.
     """
 
     cell: int
@@ -230,11 +231,25 @@ class Record:
     values: dict[str, float | None]
     curve: tuple[tuple[float, ...], ...]
     seconds: float
+    point: tuple[float, ...] = ()
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Record:
         """Return the record of a journal's line."""
-        return cls(**{**record, "curve": tuple(map(tuple, record["curve"]))})
+        curve, point = tuple(map(tuple, record["curve"])), tuple(record.get("point", ()))
+        return cls(**{**record, "curve": curve, "point": point})
+
+
+def spread(cost: Float) -> Row:
+    """Return least, quartiles and largest of costs, shape (R,); infinite ones are quantiles as they stand."""
+    method: Any = "linear" if np.isfinite(cost).all() else "inverted_cdf"
+    values = np.quantile(cost, SPREAD, method=method)
+    return dict(
+        zip(("min", "lower_quartile", "median", "upper_quartile", "max"), map(float, values), strict=True)
+    )
+
+
+SPREAD = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def records_of_cell(records: Iterable[Record], cell: int) -> list[Record]:

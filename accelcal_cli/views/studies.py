@@ -64,7 +64,15 @@ BENCHMARK = (
     Column("to tolerance", format=",d", key="evaluations_to_tolerance"),
     Column("failed", format="d", key="failures"),
     Column("time", "s", ".3f", key="seconds"),
+    Column("lower quartile", format=".3g", key="lower_quartile"),
+    Column("upper quartile", format=".3g", key="upper_quartile"),
 )
+
+SHOWN = (
+    "optimizer", "evaluations", "min", "lower_quartile", "median", "upper_quartile", "max", "mean", "success_rate",
+    "evaluations_to_tolerance", "failures", "seconds",
+)  # fmt: skip
+"""Columns that people see of each function, in order; the others are for programs."""
 
 
 def benchmark_title(study: Benchmark) -> str:
@@ -151,9 +159,8 @@ def _of_function(summary: Table, function: str) -> Table:
     keys = [column.label for column in summary.columns]
     rows = tuple(row for row in summary.rows if row[0] == function)
     failed = any(row[keys.index("failures")] for row in rows)
-    hidden = ("function", "runs") if failed else ("function", "runs", "failures")
-    table = Table(function, summary.columns, rows)
-    return table.with_columns(i for i, key in enumerate(keys) if key not in hidden)
+    shown = [key for key in SHOWN if key != "failures" or failed]
+    return Table(function, summary.columns, rows).with_columns(keys.index(key) for key in shown)
 
 
 def _parameters(name: str) -> dict[str, Any]:
