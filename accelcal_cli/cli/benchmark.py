@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,6 +35,14 @@ FUNCTIONS = (
 """Names of studies.functions, stated again so that help need not import it; tests compare them."""
 
 
+FORMATS = (*options.FORMATS, "latex")
+MOST_DIMENSIONS = 1000
+
+
+def _check_format(choice: str) -> str:
+    return options.check_choice("--format", choice, FORMATS)
+
+
 def command(
     *,
     func: Annotated[
@@ -45,10 +55,32 @@ def command(
             autocompletion=options.several_of((*FUNCTIONS, "all")),
         ),
     ] = None,
-    dim: Annotated[int, in_problem(help="Dimensions of the functions.", min=2, max=1000)] = 12,
+    dim: Annotated[
+        str,
+        in_problem(
+            help="Dimensions of the functions, one or several separated by commas.", metavar="NUMBERS"
+        ),
+    ] = "12",
+    instances: Annotated[
+        int,
+        in_problem(
+            help="Places and rotations of the functions, run by run in turn; 0: the plain functions.",
+            min=0,
+            max=1_000_000,
+        ),
+    ] = 0,
     shift: Annotated[bool, in_problem("--shift", help="Move the optimum off the centre.")] = False,
     rotate: Annotated[bool, in_problem("--rotate", help="Rotate the coordinates.")] = False,
     tolerance: Annotated[float, in_problem(help="A run succeeds with a cost at or below this.")] = 1e-8,
+    target: Annotated[
+        list[str] | None,
+        in_problem(
+            "--target",
+            help="Costs whose expected running time is told, separated by commas or repeated.",
+            show_default="the tolerance",
+            metavar="NUMBERS",
+        ),
+    ] = None,
     optimizer: Annotated[
         list[str] | None,
         in_search(
@@ -70,14 +102,32 @@ def command(
     evaluations: Annotated[
         int | None,
         in_search(
-            help="Evaluations per run; iterations follow from them.", show_default="none", min=1, max=MOST
+            help="Evaluations per run; the generation under way is finished.",
+            show_default="none",
+            min=1,
+            max=MOST,
         ),
     ] = None,
     stop: Annotated[bool, in_search("--stop", help="End a run that reaches the tolerance.")] = False,
     runs: Annotated[int, running.in_runs(help="Runs per pair.", min=1, max=1_000_000)] = 20,
     seed: running.Seed = 0,
     plot: running.Plot = None,
-    format: options.Format = "table",
+    profile: Annotated[
+        str | None,
+        options.in_output(
+            help="Draw running times, data profiles and boxes to a .png or .svg file.", metavar="FILE"
+        ),
+    ] = None,
+    format: Annotated[
+        str,
+        options.in_output(
+            "--format",
+            help="What to print: {choices}.",
+            metavar="FORMAT",
+            autocompletion=options.one_of(FORMATS),
+            callback=_check_format,
+        ),
+    ] = "table",
     study_options: running.StudyOptions,
 ) -> None:
     """Run optimizers on test functions with known minima.
@@ -85,13 +135,21 @@ def command(
     All minima are 0. Prints the spread of the cost over the runs, how many reached the tolerance and after how many
     evaluations, and ranks with a significance test when several optimizers run on several functions.
     """
-    from accelcal_cli.studies.benchmark import Benchmark, rank
+    from accelcal_cli.studies.benchmark import Benchmark, rank, unequal_budgets
     from accelcal_cli.studies.functions import select
     from accelcal_cli.studies.study import ALL, Budget, choose, median_curves, words
-    from accelcal_cli.views.studies import benchmark_blocks, benchmark_table, benchmark_title, ranking_table
+    from accelcal_cli.views.runtimes import bands, difference_table, profiles, running_time_tables
+    from accelcal_cli.views.studies import (
+        benchmark_blocks,
+        benchmark_table,
+        benchmark_title,
+        ranking_table,
+        shown_columns,
+    )
 
-    options.check_files([config], {"--raw": study_options.raw, "--plot": plot})
+    options.check_files([config], {"--raw": study_options.raw, "--plot": plot, "--profile": profile})
     options.check_plot(plot)
+    options.check_plot(profile)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
     named = words(optimizer or ())
@@ -99,7 +157,8 @@ def command(
     entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset)
     study = Benchmark(
         select(words(func or ())),
-        tuple(entries), dim, runs, seed, tolerance, evaluations, stop, shift, rotate,
+        tuple(entries), _dimensions(dim), runs, seed, tolerance, evaluations, stop, shift, rotate,
+        instances, _targets(target),
     )  # fmt: skip
     study, notes = study.suiting([] if ALL in named else [entry.label for entry in entries])
     options.tell(notes, study_options.quiet)
@@ -110,11 +169,51 @@ def command(
         median_curves(study, records),
     )
 
+    unequal = unequal_budgets(study, records)
+
     def blocks() -> list[Block]:
-        ranking = rank(study, records)
-        further = [ranking_table(ranking)] if ranking else []
+        ranking = None if unequal else rank(study, records)
+        further = [*running_time_tables(study, records)]
+        if not unequal and (differences := difference_table(study, records)):
+            further.append(differences)
+        further += [ranking_table(ranking)] if ranking else []
         return benchmark_blocks(title, rows, curves, tolerance, further)
 
-    options.print_result(format, rows, blocks)
-    running.draw_convergence(plot, title, curves, tolerance)
-    options.tell_written([study_options.raw, plot], study_options.quiet)
+    if format == "latex":
+        from accelcal_cli.output.machine import latex_text
+
+        sys.stdout.write(latex_text(shown_columns(rows)))
+    else:
+        options.print_result(format, rows, blocks)
+    if unequal and format == "table":
+        options.tell([unequal], study_options.quiet)
+    running.draw_convergence(plot, title, curves, tolerance, partial(bands, study, records))
+    if profile is not None:
+        from accelcal_cli.output.profiles import plot_profiles
+
+        plot_profiles(title, profiles(study, records), profile)
+    options.tell_written([study_options.raw, plot, profile], study_options.quiet)
+
+
+def _dimensions(text: str) -> tuple[int, ...]:
+    try:
+        numbers = [int(part) for part in text.split(",")]
+    except ValueError:
+        numbers = [0]
+    if not all(2 <= number <= MOST_DIMENSIONS for number in numbers):
+        raise UsageError(
+            f'--dim "{text}": expected whole numbers from 2 to {MOST_DIMENSIONS}, separated by commas'
+        )
+    return tuple(dict.fromkeys(numbers))
+
+
+def _targets(stated: list[str] | None) -> tuple[float, ...]:
+    from accelcal_cli.studies.study import words
+
+    try:
+        numbers = [float(part) for part in words(stated or ())]
+    except ValueError:
+        numbers = [math.nan]
+    if not all(math.isfinite(number) and number >= 0 for number in numbers):
+        raise UsageError(f'--target "{",".join(stated or ())}": expected numbers from 0, separated by commas')
+    return tuple(dict.fromkeys(numbers))

@@ -16,6 +16,7 @@ from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.schema import from_mapping
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison, PrintedEstimate
+from accelcal_cli.studies.functions import TestFunction
 from accelcal_cli.studies.scenarios import SearchSpace, Simulation
 from accelcal_cli.studies.study import (
     Curves,
@@ -100,7 +101,7 @@ class Part:
         common: dict[str, Any] = {name: getattr(self, name) for name in ("runs", "seed", "tolerance", "stop")}
         if self.functions:
             f = self.functions
-            return Benchmark(f.names, self.optimizers, f.dimensions, evaluations=f.evaluations, **common)
+            return Benchmark(f.names, self.optimizers, (f.dimensions,), evaluations=f.evaluations, **common)
         if self.simulation and self.search:
             return Comparison(self.simulation, self.search, self.optimizers, **common)
         raise ConfigError(f"{self.title}: expected functions, or simulation and search")
@@ -277,7 +278,7 @@ def coordinates(study: Benchmark, records: Sequence[Record]) -> list[Row]:
     for cell in range(study.cells):
         own = records_of_cell(records, cell)
         names = study.names(cell)
-        optimum = study.problem(names["function"]).optimum
+        optimum = TestFunction(names["function"], study.problems[cell][1]).optimum
         x, cost = np.array([r.point for r in own]), np.array([r.cost for r in own])
         for quantity, values in (("mean", (x, cost)), ("rmse", ((x - optimum) ** 2, cost**2))):
             found = [*values[0].mean(axis=0).tolist(), float(values[1].mean())]

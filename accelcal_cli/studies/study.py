@@ -218,7 +218,8 @@ class Record:
         values: further results of the kind of study (parameter errors, ...), by name.
         curve: points of evaluations and best cost so far, thinned; none beyond the first CURVES runs.
         seconds: time of the run: its share of the time of its block.
-        point: best point of a test function.
+        point: best point of a test function; hits: evaluations to each of its targets, or None; reductions: likewise to
+            each part of the first cost; instance: which place and rotation of the function, 0 is the plain one.
     """
 
     cell: int
@@ -232,12 +233,15 @@ class Record:
     curve: tuple[tuple[float, ...], ...]
     seconds: float
     point: tuple[float, ...] = ()
+    hits: tuple[int | None, ...] = ()
+    reductions: tuple[int | None, ...] = ()
+    instance: int = 0
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Record:
         """Return the record of a journal's line."""
-        curve, point = tuple(map(tuple, record["curve"])), tuple(record.get("point", ()))
-        return cls(**{**record, "curve": curve, "point": point})
+        listed = {name: tuple(record.get(name, ())) for name in ("point", "hits", "reductions")}
+        return cls(**{**record, **listed, "curve": tuple(map(tuple, record["curve"]))})
 
 
 def spread(cost: Float) -> Row:
@@ -278,6 +282,10 @@ class Study(ABC):
     @abstractmethod
     def names(self, cell: int) -> dict[str, str]:
         """Return what identifies a cell in the raw results, such as function and optimizer, by column."""
+
+    def panel(self, cell: int) -> str:
+        """Return what the curves of a cell belong to: its function, "" for a study without."""
+        return self.names(cell).get("function", "")
 
     @abstractmethod
     def execute(self, task: Task) -> list[Record]:
@@ -350,8 +358,10 @@ def _curve(run: Run, i: int) -> tuple[tuple[float, ...], ...]:
     return tuple((int(n), float(c)) for n, c in zip(counts, costs, strict=True) if np.isfinite(c))
 
 
-def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float] | None:
-    """Return the median best cost of several runs against evaluations, both of shape (points,).
+def median_curve(
+    records: Sequence[Record], points: int = TRACE_POINTS, quantile: float = 0.5
+) -> tuple[Float, Float] | None:
+    """Return the median, or another quantile, of the best cost of several runs against evaluations, shape (points,).
 
     From where all runs have a cost to the last evaluation of the longest; a run that ended keeps its cost. None
     when no run left a curve.
@@ -361,15 +371,20 @@ def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple
         return None
     grid = np.linspace(max(n[0] for n, _ in curves), max(n[-1] for n, _ in curves), points)
     rows = [cost[np.searchsorted(n, grid, side="right") - 1] for n, cost in curves]
-    return grid, np.median(rows, axis=0)
+    return grid, np.median(rows, axis=0) if quantile == 0.5 else np.quantile(rows, quantile, axis=0)
 
 
 def median_curves(study: Study, records: Sequence[Record]) -> Curves:
     """Return the median curve of each cell that left one, by function ("" for a study without) and optimizer."""
+    return quantile_curves(study, records, 0.5)
+
+
+def quantile_curves(study: Study, records: Sequence[Record], quantile: float) -> Curves:
+    """Return as `median_curves` does a quantile of the best costs."""
     panels: dict[str, dict[str, tuple[Float, Float]]] = {}
     for cell in range(study.cells):
-        names, curve = study.names(cell), median_curve(records_of_cell(records, cell))
-        panel = panels.setdefault(names.get("function", ""), {})
+        curve = median_curve(records_of_cell(records, cell), quantile=quantile)
+        panel = panels.setdefault(study.panel(cell), {})
         if curve is not None:
-            panel[names["optimizer"]] = curve
+            panel[study.names(cell)["optimizer"]] = curve
     return panels
