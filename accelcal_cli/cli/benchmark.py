@@ -52,23 +52,26 @@ def command(
             help="Test functions, separated by commas or repeated: {choices}.",
             show_default="the four of the DE-PSO paper",
             metavar="NAMES",
-            autocompletion=options.several_of((*FUNCTIONS, "all")),
+            autocompletion=options.several_of((*FUNCTIONS, "all", "bbob")),
         ),
     ] = None,
     dim: Annotated[
-        str,
+        str | None,
         in_problem(
-            help="Dimensions of the functions, one or several separated by commas.", metavar="NUMBERS"
+            help="Dimensions of the functions, one or several separated by commas.",
+            show_default="12; 5 for bbob",
+            metavar="NUMBERS",
         ),
-    ] = "12",
+    ] = None,
     instances: Annotated[
-        int,
+        int | None,
         in_problem(
             help="Places and rotations of the functions, run by run in turn; 0: the plain functions.",
+            show_default="0; 15 for bbob",
             min=0,
             max=1_000_000,
         ),
-    ] = 0,
+    ] = None,
     shift: Annotated[bool, in_problem("--shift", help="Move the optimum off the centre.")] = False,
     rotate: Annotated[bool, in_problem("--rotate", help="Rotate the coordinates.")] = False,
     tolerance: Annotated[float, in_problem(help="A run succeeds with a cost at or below this.")] = 1e-8,
@@ -103,15 +106,24 @@ def command(
         int | None,
         in_search(
             help="Evaluations per run; the generation under way is finished.",
-            show_default="none",
+            show_default="none; 1,000 D for bbob",
             min=1,
             max=MOST,
         ),
     ] = None,
     stop: Annotated[bool, in_search("--stop", help="End a run that reaches the tolerance.")] = False,
-    runs: Annotated[int, running.in_runs(help="Runs per pair.", min=1, max=1_000_000)] = 20,
+    runs: Annotated[
+        int | None,
+        running.in_runs(
+            help="Runs per pair.", show_default="20; one per instance for bbob", min=1, max=1_000_000
+        ),
+    ] = None,
     seed: running.Seed = 0,
     plot: running.Plot = None,
+    coco: Annotated[
+        str | None,
+        options.in_output(help="Folder for the data of bbob that cocopp reads.", metavar="FOLDER"),
+    ] = None,
     profile: Annotated[
         str | None,
         options.in_output(
@@ -155,11 +167,29 @@ def command(
     named = words(optimizer or ())
     budget = Budget(population, iterations, evaluations)
     entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset)
-    study = Benchmark(
-        select(words(func or ())),
-        tuple(entries), _dimensions(dim), runs, seed, tolerance, evaluations, stop, shift, rotate,
-        instances, _targets(target),
-    )  # fmt: skip
+    wanted = words(func or ())
+    study: Benchmark
+    if any(name.startswith("bbob") for name in wanted):
+        from accelcal_cli.studies import bbob
+
+        bbob.cocoex()
+        if shift or rotate or instances == 0:
+            raise UsageError("--shift, --rotate, --instances 0: not with bbob, whose instances do it")
+        if coco is not None and (study_options.jobs > 1 or study_options.cluster or study_options.resume):
+            raise UsageError("--coco: not with --jobs, --cluster or --resume; its data are written in one go")
+        count = instances or bbob.INSTANCES
+        study = bbob.Bbob(
+            bbob.select(wanted), tuple(entries), _dimensions(dim or "5"), runs or count, seed, tolerance, evaluations,
+            stop, instances=count, targets=_targets(target), folder=coco or "",
+        )  # fmt: skip
+    elif coco is not None:
+        raise UsageError("--coco needs --func bbob")
+    else:
+        study = Benchmark(
+            select(wanted),
+            tuple(entries), _dimensions(dim or "12"), runs or 20, seed, tolerance, evaluations, stop, shift, rotate,
+            instances or 0, _targets(target),
+        )  # fmt: skip
     study, notes = study.suiting([] if ALL in named else [entry.label for entry in entries])
     options.tell(notes, study_options.quiet)
     records = study_options.run(study)

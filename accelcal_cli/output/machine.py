@@ -28,22 +28,21 @@ _STEERING = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 """Control characters that JSON may hold as they are, and that a terminal would obey."""
 
 
-SPECIAL = {c: f"\\{c}" for c in "&%$#_{}"} | {
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "\\": r"\textbackslash{}",
-}
+SPECIAL = str.maketrans({
+    "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
+})  # fmt: skip
+"""What LaTeX takes for more than a character."""
 
 
 def latex_text(table: Table) -> str:
     """Return a table as LaTeX with the rules of the package booktabs; its notes stand under it."""
 
-    def cell(text: str) -> str:
-        return "".join(SPECIAL.get(c, c) for c in text)
-
     left = [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
-    heads = [cell(f"{c.name} [{c.unit}]" if c.unit else c.name) for c in table.columns]
-    rows = [[cell(c.text(v)) for c, v in zip(table.columns, row, strict=True)] for row in table.rows]
+    heads = [(f"{c.name} [{c.unit}]" if c.unit else c.name).translate(SPECIAL) for c in table.columns]
+    rows = [
+        [c.text(v).translate(SPECIAL) for c, v in zip(table.columns, row, strict=True)] for row in table.rows
+    ]
     lines = [
         f"\\begin{{tabular}}{{{''.join('l' if word else 'r' for word in left)}}}",
         "\\toprule",

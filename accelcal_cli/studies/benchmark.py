@@ -113,6 +113,10 @@ class Benchmark(Study):
         """Return the number of a run's place and rotation, from 1; 0 without instances."""
         return 1 + run % self.instances if self.instances else 0
 
+    def budget(self, dimensions: int) -> int | None:  # noqa: ARG002
+        """Return the evaluations that every optimizer has in these dimensions; None when each has its own."""
+        return self.evaluations
+
     def names(self, cell: int) -> dict[str, str]:
         """Return function and optimizer of a cell; see `Study.names`."""
         function, _, entry = self.problems[cell]
@@ -270,9 +274,9 @@ CUT_OFF = ("iterations", "evaluations")
 
 def unequal_budgets(study: Benchmark, records: Sequence[Record]) -> str | None:
     """Return a sentence when the optimizers had different budgets, so that their costs say nothing of their ranks."""
-    if study.evaluations is not None:
-        return None
     for D in study.dimensions:
+        if study.budget(D) is not None:
+            continue
         used: dict[str, int] = {}
         given: dict[str, int] = {}
         for r in records:
@@ -292,7 +296,7 @@ def unequal_budgets(study: Benchmark, records: Sequence[Record]) -> str | None:
 
 
 @dataclass(frozen=True)
-class Difference:
+class PairDifference:
     """Two optimizers that differ on one function: the better, the worse, and the p of Holm."""
 
     function: str
@@ -302,7 +306,7 @@ class Difference:
     p: float
 
 
-def pairwise(study: Benchmark, records: Sequence[Record]) -> tuple[list[Difference], int]:
+def pairwise(study: Benchmark, records: Sequence[Record]) -> tuple[list[PairDifference], int]:
     """Return the pairs of optimizers that differ at LEVEL on a function, and how many pairs were tested.
 
     Wilcoxon's rank sum test of the costs of the runs, two-sided, corrected by [holm1979] for all pairs on the function.
@@ -322,7 +326,7 @@ def pairwise(study: Benchmark, records: Sequence[Record]) -> tuple[list[Differen
             for (a, b), corrected in zip(pairs, holm(p), strict=True):
                 if corrected < LEVEL:
                     better, worse = (a, b) if _ranked_below(costs[a], costs[b]) else (b, a)
-                    found.append(Difference(function, D, better, worse, corrected))
+                    found.append(PairDifference(function, D, better, worse, corrected))
     return found, tested
 
 

@@ -106,8 +106,10 @@ def benchmark_title(study: Benchmark) -> str:
     changes = ", shifted" * study.shift + ", rotated" * study.rotate
     if study.instances:
         changes = f", {study.instances} instances"
-    if study.evaluations is not None:
-        changes += f", {study.evaluations:,} evaluations (the last generation is finished)"
+    budgets = [budget for D in study.dimensions if (budget := study.budget(D)) is not None]
+    if budgets:
+        counts = " and ".join(dict.fromkeys(f"{budget:,}" for budget in budgets))
+        changes += f", {counts} evaluations (the last generation is finished)"
     sizes = ", ".join(map(str, study.dimensions))
     return f"Benchmark: D = {sizes}, {runs}, tolerance {study.tolerance:g}, seed {study.seed}{changes}"
 
