@@ -399,6 +399,10 @@ class Calibration:
 
         return text(self)
 
+    def _repr_pretty_(self, printer: Any, _: bool) -> None:
+        """The same where IPython has no HTML."""
+        printer.text(str(self))
+
     def _repr_html_(self) -> str:
         """The same as a table, for notebooks."""
         from accelcal_cli.views.quoted import html
