@@ -114,7 +114,7 @@ def plan(
     Raises:
         UsageError: an unknown fixture, or no number of poses to add.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import plan
         >>> proposal = plan(add=12, noise=0.01)
         >>> len(proposal.directions), proposal.verdict

@@ -178,7 +178,7 @@ def apply(
     Raises:
         UsageError: an undetermined result without `force`. DataError: a log that cannot be read.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import apply, calibrate, simulate
         >>> simulated = simulate("mems", positions=24)
         >>> result = calibrate(simulated.output)

@@ -47,7 +47,7 @@ def calibrate(
         DataError: readings without any information (all equal, fewer than two), or without the weights asked for.
         ConfigError: unknown setting, optimizer or parameter.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import calibrate, simulate
         >>> readings = simulate("mems", positions=24, seed=3).output
         >>> result = calibrate(readings, g=9.81)
@@ -74,7 +74,7 @@ def calibrate_many(
     Raises:
         DataError, ConfigError: as in `calibrate`; the message names the sensor.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import calibrate_many, simulate
         >>> results = calibrate_many([simulate("mems", positions=12, seed=s).output for s in (1, 2)])
         >>> [result.verdict for result in results]

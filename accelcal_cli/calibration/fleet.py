@@ -148,7 +148,7 @@ def fleet(
     Raises:
         ConfigError: settings that are not for a fleet. DataError: a table that cannot be read.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import fleet, simulate
         >>> poses = {f"S{n}": simulate("mems", positions=24, seed=n).output for n in (1, 2, 3)}
         >>> print(fleet(poses))

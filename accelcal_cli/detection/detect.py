@@ -189,7 +189,7 @@ def detect(
         log: a file, a frame, or an open log.
         settings: how the poses are found; the defaults, with `keys`, when None.
         picture: keep what a picture of the log needs.
-        columns, gyro, time: see `read_log`.
+        columns: the three columns of acceleration; gyro: of turning rate; time: a column; see `read_log`.
         keys: `window`, `still`, `min_length`, `trim` in seconds or as "150rows"; `min_poses`; `rate`, `multipliers`,
             `merge`, `thin` of `DetectSettings`; `g`, or `latitude` with `height`.
 
@@ -197,7 +197,7 @@ def detect(
         UsageError: lengths that do not fit the log. DataError: unreadable.
         TooFewPosesError: no multiplier finds enough attitudes; the message says what was found.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import calibrate, detect, simulate
         >>> log = simulate("mems", positions=13, raw=True, seed=2)
         >>> detection = detect(log)

@@ -79,7 +79,7 @@ def read_log(source: Source, **how: Any) -> RawLog:
     Args:
         source: path, ``-``, or a frame; how: see `open_raw_log`.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import read_log, simulate
         >>> log = read_log(simulate("mems", positions=2, raw=True))
         >>> round(log.clock.rate), log.to_frame().columns

@@ -136,7 +136,7 @@ def export(result: Calibration | str | Path, to: str, *, force: bool = False, **
     Raises:
         ConfigError: no such format or option. UsageError: the format cannot hold this result.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import calibrate, export, simulate
         >>> result = calibrate(simulate("mems", positions=24).output)
         >>> file = export(result, "c-header")

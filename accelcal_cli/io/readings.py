@@ -217,7 +217,7 @@ def read_readings(
         DataError: a fault of the input, with its place, or readings of several sensors.
         UsageError: a fault of `columns` or of the conditions `options.where`.
 
-    Example:
+    Examples:
         >>> import polars
         >>> from accelcal_cli import read_readings, simulate
         >>> simulated = simulate("mems", positions=12)

@@ -53,7 +53,7 @@ def report(
     Raises:
         UsageError: jinja2 or matplotlib is missing. OutputError: it cannot be written.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import calibrate, report, simulate
         >>> page = report(calibrate(simulate("mems", positions=24).output), title="Desk 1")
         >>> "Desk 1" in page

@@ -233,7 +233,7 @@ def local_gravity(
     Raises:
         UsageError: out of range, stated twice, or a height without a latitude.
 
-    Example:
+    Examples:
         >>> local_gravity("g")
         1.0
         >>> round(local_gravity(latitude=48.1, height=500), 5)

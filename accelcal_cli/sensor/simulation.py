@@ -192,7 +192,7 @@ def simulate(
     Raises:
         ConfigError: no such sensor. UsageError: no such scheme.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import simulate
         >>> simulate("mems", positions=24, samples=10).output.shape
         (240, 3)

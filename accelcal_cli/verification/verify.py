@@ -162,7 +162,7 @@ def verify(
         DataError: the result states no uncertainty, so that there is nothing to compare with; or no reading is near g
             under it, as in another unit.
 
-    Example:
+    Examples:
         >>> from accelcal_cli import calibrate, simulate, verify
         >>> old = calibrate(simulate("mems", positions=24, seed=1).output)
         >>> verify(old, simulate("mems", positions=24, seed=2).output).verdict
