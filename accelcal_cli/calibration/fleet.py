@@ -47,7 +47,7 @@ NAMED = 3
 LEVEL = 0.01
 """Chance of naming a sensor where none stands out (Bonferroni over sensors and quantities)."""
 
-NOISE = "noise of a pose, s"
+NOISE = "noise of one pose, s"
 """Name of the quantity s beside those of the nine parameters."""
 
 FEWEST = 10

@@ -199,7 +199,7 @@ class Calibration:
         dop: dilution of precision of the poses as they count; geometry: of their distinct attitudes, each counted once
             and all together as twelve, which the verdict on the poses rests on.
         verdict: good, weak, suspect or undetermined; `reasons` says in sentences what the poses leave open.
-        suggestions: poses that would mend it.
+        suggestions: poses to add.
         warnings: what speaks against the readings, the fit or the search; one of severity `warning` makes it suspect.
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.

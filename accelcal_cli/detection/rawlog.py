@@ -91,7 +91,7 @@ def read_log(source: Source, **how: Any) -> RawLog:
 def sensors_of(
     source: str | Path, sensor: str | None = None, *, options: ReadOptions = PLAIN
 ) -> tuple[tuple[str, str], ...]:
-    """Return the sensors whose rows a log file holds: the label of each, and the condition that chooses its rows.
+    """Return the sensors that a log file has rows of: the label of each, and the condition that chooses its rows.
 
     Args:
         source: path. sensor: the column that labels them; None to find it by its name.

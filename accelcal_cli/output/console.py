@@ -173,7 +173,7 @@ def _widths(cells: list[list[str]]) -> list[int]:
 
 
 def _show_stacked(table: Table, out: Console) -> None:
-    """Print every row as a heading and one line a column, so that the narrowest terminal loses no digit."""
+    """Print every row as a heading and one line per column, so that the narrowest terminal loses no digit."""
     out.print(Text(table.title, "bold"))
     for row in table.rows:
         first, *rest = zip(table.columns, row, strict=True)
