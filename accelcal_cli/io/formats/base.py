@@ -192,6 +192,14 @@ class RandomAccess:
         self._files.close()
 
 
+def cut_out(data: bytes, starts: Sequence[int], size: int) -> np.ndarray:
+    """Return the pieces of some bytes that begin at `starts` (B,), each of `size` bytes, shape (B, size), uint8."""
+    if not len(starts):
+        return np.empty((0, size), dtype=np.uint8)
+    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), size)
+    return np.asarray(windows[np.asarray(starts, dtype=np.intp)])
+
+
 def no_room(name: str, problem: OSError) -> DataError:
     """Return what to raise where a working copy of an input cannot be written."""
     return DataError(f"{name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})")

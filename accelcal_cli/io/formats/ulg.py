@@ -20,7 +20,14 @@ import numpy as np
 
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.formats.base import ACCELERATION, LOG_FORMATS, TURNING, LogFormat, choose_accelerometer
+from accelcal_cli.io.formats.base import (
+    ACCELERATION,
+    LOG_FORMATS,
+    TURNING,
+    LogFormat,
+    choose_accelerometer,
+    cut_out,
+)
 from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
@@ -98,8 +105,7 @@ class _Topic:
 
     def cells(self, data: bytes) -> np.ndarray:
         """Return the bytes of all rows of the block, shape (B, least)."""
-        starts = np.array(self.rows, dtype=np.intp)
-        return np.asarray(np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(self.least)])
+        return cut_out(data, self.rows, self.least)
 
     def numbers(self, cells: np.ndarray, name: str, at: int = 0) -> np.ndarray:
         """Return a number of each row, shape (B,), by the rows' bytes: of a field the one at a place."""
