@@ -95,6 +95,7 @@ def command(
         ),
     ] = None,
     preset: running.Preset = None,
+    peer: running.Peers = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
@@ -164,10 +165,11 @@ def command(
     options.check_plot(profile)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
-    named = words(optimizer or ())
+    named, peers = words(optimizer or ()), running.peer_entries(peer)
+    if not (wanted := words(func or ())) or not wanted[0].startswith("bbob"):
+        evaluations = running.peer_budget(peer, evaluations)
     budget = Budget(population, iterations, evaluations)
-    entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset)
-    wanted = words(func or ())
+    entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset) + peers
     study: Benchmark
     if any(name.startswith("bbob") for name in wanted):
         from accelcal_cli.studies import bbob
