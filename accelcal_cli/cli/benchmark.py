@@ -151,7 +151,8 @@ def command(
     from accelcal_cli.studies.benchmark import Benchmark, rank, unequal_budgets
     from accelcal_cli.studies.functions import select
     from accelcal_cli.studies.study import ALL, Budget, choose, median_curves, words
-    from accelcal_cli.views.runtimes import bands, difference_table, profiles, running_time_tables
+    from accelcal_cli.views.blocks import BLANK, Paragraph
+    from accelcal_cli.views.runtimes import bands, difference_block, profiles, running_time_tables
     from accelcal_cli.views.studies import (
         benchmark_blocks,
         benchmark_table,
@@ -205,9 +206,9 @@ def command(
 
     def blocks() -> list[Block]:
         ranking = None if unequal else rank(study, records)
-        further = [*running_time_tables(study, records)]
-        if not unequal and (differences := difference_table(study, records)):
-            further.append(differences)
+        further: list[Block] = [*running_time_tables(study, records)]
+        if not unequal and (differences := difference_block(study, records)):
+            further += [differences, BLANK] if isinstance(differences, Paragraph) else [differences]
         further += [ranking_table(ranking)] if ranking else []
         return benchmark_blocks(title, rows, curves, tolerance, further)
 
