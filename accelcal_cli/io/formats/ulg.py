@@ -259,6 +259,7 @@ class Px4Log(LogFormat):
         self._scanner, self._cut = _UlogScanner(), 0
         self._origin: int | None = None
         self._devices: set[int] = set()
+        self._warm: Float = np.empty((0, 2))  # time and temperature that were logged last
         self._scanned = self._scan(source)
         self._first = next(self._scanned, b"")
         able = {self._called(topic): topic for topic in self._accelerometers()}
@@ -291,8 +292,14 @@ class Px4Log(LogFormat):
         if combined and "gyro_rad" in self._topic.places:
             self._columns += [("gyro_rad", k) for k in range(3)]
             names, units = [*names, *TURNING], [*units, *["rad/s"] * 3]
-        if "temperature" in self._topic.places:
-            self._columns.append(("temperature", 0))
+        own = "temperature" in self._topic.places
+        self._columns += [("temperature", 0)] * own
+        self._thermometers = [
+            topic
+            for topic in (self._accelerometers() if combined else [])
+            if topic.name == ACCEL and {"temperature", "device_id"} <= topic.places.keys()
+        ]
+        if own or self._thermometers:
             names, units = [*names, "temperature"], [*units, "degC"]
         self.names, self.units = tuple(names), tuple(units)
 
@@ -305,7 +312,21 @@ class Px4Log(LogFormat):
             if len(times) and self._origin is None:
                 self._origin = int(times[0])
             columns = [self._topic.numbers(cells, name, at) for name, at in self._columns]
+            if self._thermometers:
+                columns.append(self._temperature(data, times))
             yield np.column_stack([(times - (self._origin or 0)) / 1e6, *columns])
+
+    def _temperature(self, data: bytes, times: Int) -> Float:
+        """Return the temperature of the combined device at some times, (B,): the last before them, NaN without one."""
+        device, known = self._device(), [self._warm]
+        for topic in self._thermometers:
+            cells = topic.cells(data)
+            parts = [topic.numbers(cells, name).astype(float) for name in ("timestamp", "temperature")]
+            known.append(np.column_stack(parts)[topic.numbers(cells, "device_id") == device])
+        rows = np.concatenate(known)
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        self._warm = rows[-1:]
+        return np.append(np.nan, rows[:, 1])[np.searchsorted(rows[:, 0], times, side="right")]
 
     def _scan(self, source: ByteSource) -> Iterator[bytes]:
         """Scan the log; yield each block, whose rows the scanner's topics know until the next is asked for.
