@@ -67,7 +67,9 @@ class BbobFunction(Problem):
         coco = cocoex()
         self.name = f"bbob-f{number}"
         which = f"dimensions: {dimensions} function_indices: {number}"
-        self._suite = coco.Suite("bbob", f"instances: {instance}", which)  # a suite's own instances differ by year
+        self._suite = coco.Suite(
+            "bbob", f"instances: {instance}", which
+        )  # a suite's own instances differ by year
         self._problem = self._suite.get_problem(0)
         self.lower, self.upper = (np.array(self._problem.lower_bounds), np.array(self._problem.upper_bounds))
         self.least = float(coco.BareProblem("bbob", number, dimensions, instance).best_value())
@@ -120,10 +122,10 @@ class Bbob(Benchmark):
         """Return the record of a task's run."""
         name, D, entry = self.problems[task.cell]
         evaluations = self.budget(D)
-        optimizer = Budget(evaluations=evaluations).limit(entry).build()
+        limited = Budget(evaluations=evaluations).limit(entry)
         problem = self._function(name, D, self.instance(task.first), self._observer(entry.label))
         try:
-            return self.timed(replace(task, last=task.first + 1), problem, optimizer, evaluations)
+            return self.timed(replace(task, last=task.first + 1), problem, limited, evaluations)
         finally:
             problem.close()
 
