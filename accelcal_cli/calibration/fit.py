@@ -359,11 +359,9 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
         spread = scattered_spread(spread, rows, w, cofactor, stated.noise, freedom)
         if stated.own is not None:
             spread = spread.by_own(stated.own, stated.noise.freedom(np.ones_like(w)))
-    for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses)).tolist():
+    for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses) | sample.in_time).tolist():
         one = _clusters(solution, point, at)
-        covariance, own, clusters[at] = one.spread(cofactor[at, :9, :9])
-        spread.covariance[at, :9, 9:], spread.covariance[at, 9:, :9] = 0.0, 0.0
-        spread.covariance[at, :9, :9], spread.freedom[at] = covariance, own
+        spread.covariance[at], spread.freedom[at], clusters[at] = one.spread(cofactor[at])
     return spread, clusters
 
 
@@ -377,9 +375,11 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
         count, last = count + int(jumps(u, last).sum()), u[-1]
     clusters = Clusters.of(int(sample.poses[0]), count)
     for first, e, f in sample.errors(*sensor):
-        u = unit(f[0])
-        w = np.ones(len(u)) if weights is None else weights[at, first : first + len(u)]
-        clusters.add(np.ascontiguousarray(u), np.sqrt(w) * e[0], w)
+        u = np.ascontiguousarray(unit(f[0]))
+        part = slice(first, first + len(u))
+        w = np.ones(len(u)) if weights is None else weights[at, part]
+        rows = design(u) if solution.slopes is None else solution.slopes.rows[0, part]
+        clusters.add(u, rows, np.sqrt(w) * e[0], w)
     return clusters
 
 

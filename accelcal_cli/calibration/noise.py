@@ -455,13 +455,13 @@ class Clusters:
 
     Attributes:
         length: rows of a cluster at most.
-        information: A^T W A of each, shape (C, 9, 9); score: A^T W e of each, and ones: A^T W 1, shape (C, 9).
+        information: A^T W A of each, shape (C, q, q); score: A^T W e of each, and ones: A^T W 1, shape (C, q).
     """
 
     length: int
-    information: Float = field(default_factory=lambda: np.zeros((0, 9, 9)))
-    score: Float = field(default_factory=lambda: np.zeros((0, 9)))
-    ones: Float = field(default_factory=lambda: np.zeros((0, 9)))
+    information: Float = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    score: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    ones: Float = field(default_factory=lambda: np.zeros((0, 0)))
     _last: Float | None = None
     _open: int = 0
 
@@ -470,19 +470,19 @@ class Clusters:
         """Return clusters for so many rows: the attitudes where they jump often enough, else blocks of time."""
         return cls(rows if jumps >= FEWEST_JUMPS else -(-2 * rows // MOST_CLUSTERS))
 
-    def add(self, u: Float, scaled: Float, w: Float) -> None:
-        """Add rows: unit directions, shape (B, 3), sqrt(w) e and w, shape (B,)."""
+    def add(self, u: Float, design: Float, scaled: Float, w: Float) -> None:
+        """Add rows: unit directions, shape (B, 3), A, shape (B, q), sqrt(w) e and w, shape (B,)."""
         jump = jumps(u, self._last)
         since = np.arange(len(u)) + self._open
         start = np.maximum.accumulate(np.where(jump, since, 0))
         begins = jump | ((since - start) % self.length == 0)
         begins[0] |= self._last is None
-        rows = design(u) * np.sqrt(w)[:, None]
+        rows, q = design * np.sqrt(w)[:, None], design.shape[1]
         at = np.flatnonzero(begins)
         head = at[0] if len(at) else len(u)
         cuts = np.concatenate([[0] if head else [], at]).astype(np.intp)
-        outer = np.add.reduceat((rows[:, :, None] * rows[:, None, :]).reshape(len(u), 81), cuts, axis=0)
-        information = outer.reshape(-1, 9, 9)
+        outer = np.add.reduceat((rows[:, :, None] * rows[:, None, :]).reshape(len(u), q * q), cuts, axis=0)
+        information = outer.reshape(-1, q, q)
         score = np.add.reduceat(rows * scaled[:, None], cuts, axis=0)
         ones = np.add.reduceat(rows * np.sqrt(w)[:, None], cuts, axis=0)
         if head and len(self.score):
@@ -490,8 +490,11 @@ class Clusters:
             self.score[-1] += score[0]
             self.ones[-1] += ones[0]
             information, score, ones = information[1:], score[1:], ones[1:]
-        self.information = np.concatenate([self.information, information])
-        self.score, self.ones = np.concatenate([self.score, score]), np.concatenate([self.ones, ones])
+        if self._last is None:
+            self.information, self.score, self.ones = information, score, ones
+        else:
+            self.information = np.concatenate([self.information, information])
+            self.score, self.ones = np.concatenate([self.score, score]), np.concatenate([self.ones, ones])
         self._last, self._open = u[-1], int(since[-1] - start[-1]) + 1 if len(at) else self._open + len(u)
         while len(self.score) > MOST_CLUSTERS:
             self._merge()
@@ -503,12 +506,12 @@ class Clusters:
         self.score, self.ones = (np.add.reduceat(part, pairs, axis=0) for part in (self.score, self.ones))
 
     def spread(self, cofactor: Float) -> tuple[Float, float, int]:
-        """Return the covariance of the parameters, shape (9, 9), its degrees of freedom, and the number of clusters.
+        """Return the covariance of the parameters, shape (q, q), its degrees of freedom, and the number of clusters.
 
         Neighbours are merged until their sums no longer follow each other.
 
         Args:
-            cofactor: (A^T W A)^-1, shape (9, 9).
+            cofactor: (A^T W A)^-1, shape (q, q).
         """
         while len(self.score) >= 2 * FEWEST_CLUSTERS and self._correlated(cofactor):
             self._merge()
