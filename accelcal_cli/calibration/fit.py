@@ -141,13 +141,16 @@ class Fit:
     def patterns(self) -> tuple[Float, Float]:
         """P-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
 
-        NaN with known attitudes, where slopes are fitted, and where not all residuals are kept.
+        NaN with known attitudes, where slopes are fitted, for poses in time, whose sigma counts with drift, and where not
+        all residuals are kept.
         """
         poses = self.sample.poses
         every = self.residuals.pose.shape[1] >= int(poses.max())
         if self.solution is None or self.solution.slopes is not None or not every:
             return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
-        return bend_and_drift(self.residuals, poses, self.settings.g)
+        bend, drift = bend_and_drift(self.residuals, poses, self.settings.g)
+        apart = ~self.sample.in_time
+        return np.where(apart, bend, np.nan), np.where(apart, drift, np.nan)
 
     @property
     def temperature(self) -> Temperature | None:
@@ -361,7 +364,9 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
             spread = spread.by_own(stated.own, stated.noise.freedom(np.ones_like(w)))
     for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses) | sample.in_time).tolist():
         one = _clusters(solution, point, at)
-        spread.covariance[at], spread.freedom[at], clusters[at] = one.spread(cofactor[at])
+        spread.covariance[at], spread.freedom[at], clusters[at] = one.spread(
+            cofactor[at], in_time=bool(sample.in_time[at])
+        )
     return spread, clusters
 
 

@@ -289,6 +289,9 @@ JUMP = 5.0
 MOST_CLUSTERS, FEWEST_CLUSTERS = 2048, 16
 """Clusters that are held, and the fewest that adjacent ones are merged into."""
 
+FEWEST_IN_TIME = 8
+"""The fewest that those of poses in time are merged into."""
+
 FEWEST_JUMPS = 8
 """Jumps of the attitude from which on what is between them is a pose, and rows of one pose are not independent."""
 
@@ -505,15 +508,19 @@ class Clusters:
         self.information = np.add.reduceat(self.information, pairs, axis=0)
         self.score, self.ones = (np.add.reduceat(part, pairs, axis=0) for part in (self.score, self.ones))
 
-    def spread(self, cofactor: Float) -> tuple[Float, float, int]:
+    def spread(self, cofactor: Float, *, in_time: bool) -> tuple[Float, float, int]:
         """Return the covariance of the parameters, shape (q, q), its degrees of freedom, and the number of clusters.
 
-        Neighbours are merged until their sums no longer follow each other.
+        Neighbours are merged until their sums no longer follow each other; poses `in_time`, whose drift shows in three
+        of the parameters alone, until there are few: a drift over many poses is within a cluster then.
 
         Args:
             cofactor: (A^T W A)^-1, shape (q, q).
         """
-        while len(self.score) >= 2 * FEWEST_CLUSTERS and self._correlated(cofactor):
+        many, fewest = 2 * FEWEST_CLUSTERS, FEWEST_IN_TIME if in_time else FEWEST_CLUSTERS
+        while in_time and len(self.score) >= many:
+            self._merge()
+        while len(self.score) >= 2 * fewest and self._correlated(cofactor):
             self._merge()
         return *_cr2(self, cofactor), len(self.score)
 

@@ -151,7 +151,8 @@ def command(
     rest = None
     own_g = partial(local_g, settings, gravity, config)
     if worn:
-        rest = wear.find(data, columns, log, own_g, form, misalignment=settings.misalignment)
+        parts = {"misalignment": settings.misalignment, "slopes": settings.temperature}
+        rest = wear.find(data, columns, log, own_g, form, **parts)
         readings = rest.readings()
     elif raw:
         readings = log.poses(data, columns, own_g, form, misalignment=settings.misalignment)

@@ -226,7 +226,7 @@ class _Logs:
         """Find the static poses of a log."""
         if not self.worn:
             return self.log.detect(source, self.columns, self.local_g, form)
-        return wear.find(source, self.columns, self.log, self.local_g, form, misalignment=True)
+        return wear.find(source, self.columns, self.log, self.local_g, form, misalignment=True, slopes=True)
 
     def told(self) -> list[str]:
         """Return the notes, each once with the number of its logs where there are several."""

@@ -41,8 +41,9 @@ def find(
     form: options.TextOptions,
     *,
     misalignment: bool,
+    slopes: bool,
 ) -> Wear:
-    """Find where a worn sensor rests; see `options.DetectionOptions.poses`."""
+    """Find where a worn sensor rests; see `options.DetectionOptions.poses`, and `WornSettings` for `slopes`."""
     from accelcal_cli.detection.rawlog import open_raw_log
     from accelcal_cli.detection.worn import WornSettings, find_wear
 
@@ -57,13 +58,8 @@ def find(
         options=form.read_options(),
     )
     try:
-        return find_wear(
-            raw,
-            WornSettings(
-                options.check_positive("--rate", log.rate, " of rows per second"),
-                log.min_poses or few,
-                gravity(raw.columns.unit),
-            ),
-        )
+        rate = options.check_positive("--rate", log.rate, " of rows per second")
+        g = gravity(raw.columns.unit)
+        return find_wear(raw, WornSettings(rate, log.min_poses or few, g, slopes and misalignment))
     finally:
         raw.close()

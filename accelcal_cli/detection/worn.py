@@ -1,9 +1,10 @@
 """Days of wear: the windows in which a worn sensor rests, the poses that they make, and the figures of GGIR.
 
-A window of 10 s is at rest where no axis scatters by more than 13 mg [vanhees2014], or than the sensor itself does. What
-is no rest, though still: windows across a gap, and those that repeat one reading, as idle loggers do. Windows that
+A window of 10 s is at rest where no axis scatters by more than 13 mg [vanhees2014], or than the sensor itself does.
+What is no rest, though still: windows across a gap, and those that repeat one reading, as idle loggers do. Windows that
 follow each other in one attitude and at one temperature are one pose: a watch on a table for hours is a few poses and
-not thousands. Poses near in time share what the sensor drifts by, so that the readings say that they follow in time.
+not thousands. Where the poses of other temperatures than usual are too few to tell slopes, as those of a watch that was
+taken off once, they are left out. Poses near in time share what the sensor drifts by: their readings say so.
 """
 
 from __future__ import annotations
@@ -14,8 +15,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.calibration.observability import APART, attitudes, directions_of
+from accelcal_cli.calibration.observability import (
+    APART,
+    WEAK,
+    Observability,
+    attitudes,
+    design,
+    directions_of,
+    unit,
+)
 from accelcal_cli.calibration.result import Calibration, Worn
+from accelcal_cli.calibration.temperature import FEWEST_FOR_SLOPES, SMALLEST_RANGE
 from accelcal_cli.detection.detect import readings_of, screen
 from accelcal_cli.detection.intervals import Intervals
 from accelcal_cli.detection.rawlog import RawLog
@@ -59,11 +69,13 @@ class WornSettings:
     Attributes:
         rate: rows per second, Hz; that of the time column when None.
         least_poses: attitudes that must be found, APART degrees apart; g: local gravity in the unit of the readings.
+        slopes: whether slopes with temperature are fitted where the poses determine them.
     """
 
     rate: float | None = None
     least_poses: int = 12
     g: float = STANDARD_GRAVITY
+    slopes: bool = True
 
 
 @dataclass(frozen=True)
@@ -207,11 +219,12 @@ def find_wear(log: RawLog, settings: WornSettings) -> Wear:
         temperature=_temperature(whole[rest, tiles.warm_at]) if tiles.warm else None,
         rows=rows,
     )
+    intervals, left_out = at_usual_temperature(join(windows, TILT, size), slopes=settings.slopes)
     wear = Wear(
         source=log.name,
         sha256=log.sha256,
         columns=log.columns.names,
-        notes=(*log.notes, *tiles.gaps.notes(log.clock.unit)),
+        notes=(*log.notes, *tiles.gaps.notes(log.clock.unit), *left_out),
         form=replace(log.form, rows=tiles.rows, rate_hz=rate),
         warnings=(
             *log.zero_rows(tiles.rows),
@@ -221,7 +234,7 @@ def find_wear(log: RawLog, settings: WornSettings) -> Wear:
         limit=limit,
         size=size,
         windows=windows,
-        intervals=join(windows, TILT, size),
+        intervals=intervals,
         hours=hours,
         behind=Behind(head, tiles.low, tiles.high),
     )
@@ -287,6 +300,41 @@ def _begins(windows: RestWindows, radius: float) -> list[int]:
             x, y, z, warm = a, b, c, now
         last = number
     return begins
+
+
+def at_usual_temperature(intervals: Intervals, *, slopes: bool) -> tuple[Intervals, tuple[str, ...]]:
+    """Return the poses near the usual temperature, where they do not determine `slopes` with it, and what is left out.
+
+    Nothing corrects the others then, and they are often of one attitude, which their error would turn the result by.
+    """
+    degrees = intervals.temperature
+    if (
+        degrees is None
+        or np.ptp(degrees) < SMALLEST_RANGE
+        or (slopes and _tell_slopes(intervals.mean, degrees))
+    ):
+        return intervals, ()
+    order = np.argsort(degrees)
+    rows = np.cumsum(intervals.n[order])
+    usual = float(degrees[order][np.searchsorted(rows, 0.5 * rows[-1])])
+    near = np.abs(degrees - usual) <= 0.5 * SMALLEST_RANGE
+    left = int(np.count_nonzero(~near))
+    note = (
+        f"{left:,} poses that are not within {0.5 * SMALLEST_RANGE:g} degrees of the usual {usual:.3g} left out: they "
+        "are too few, or in too few attitudes, to tell slopes with temperature"
+    )
+    return intervals.take(np.flatnonzero(near)), (note,) if left else ()
+
+
+def _tell_slopes(mean: Float, degrees: Float) -> bool:
+    """Return whether poses determine slopes with temperature beside the nine parameters."""
+    if len(mean) < FEWEST_FOR_SLOPES:
+        return False
+    u = unit(mean)
+    t = ((degrees - degrees.mean()) / (0.5 * np.ptp(degrees)))[:, None]
+    rows = np.hstack([design(u), -u * u * t, u * t])
+    observability = Observability.of(rows.T @ rows, len(rows))
+    return bool(observability.rank == rows.shape[1] and observability.dop[9:].max() <= WEAK)
 
 
 def _check_attitudes(wear: Wear) -> None:

@@ -195,7 +195,7 @@ def worn(figures: Worn) -> Table:
         ("hours recorded", f"{figures.hours:.4g}", "h"),
         ("hours at rest", f"{figures.rest_hours:.4g}", "h"),
     )
-    note = "Error: mean of | |a| - 1 g | over the windows. GGIR asks for a filled sphere and an error after below 10 mg."
+    note = "Error: mean of | |a| - 1 g | over the windows. GGIR asks for a filled sphere and less than 10 mg after."
     return Table(
         "Days of wear", (Column("quantity"), Column("value"), Column("unit", beside=True)), rows, (note,)
     )
