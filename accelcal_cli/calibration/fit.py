@@ -141,8 +141,8 @@ class Fit:
     def patterns(self) -> tuple[Float, Float]:
         """P-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
 
-        NaN with known attitudes, where slopes are fitted, for poses in time, whose sigma counts with drift, and where not
-        all residuals are kept.
+        NaN with known attitudes, where slopes are fitted, for poses in time, whose sigma counts with drift, and where
+        not all residuals are kept.
         """
         poses = self.sample.poses
         every = self.residuals.pose.shape[1] >= int(poses.max())

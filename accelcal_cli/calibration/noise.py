@@ -292,6 +292,9 @@ MOST_CLUSTERS, FEWEST_CLUSTERS = 2048, 16
 FEWEST_IN_TIME = 8
 """The fewest that those of poses in time are merged into."""
 
+BARTLETT = 0.5
+"""Weight of the covariance of neighbours."""
+
 FEWEST_JUMPS = 8
 """Jumps of the attitude from which on what is between them is a pose, and rows of one pose are not independent."""
 
@@ -522,7 +525,7 @@ class Clusters:
             self._merge()
         while len(self.score) >= 2 * fewest and self._correlated(cofactor):
             self._merge()
-        return *_cr2(self, cofactor), len(self.score)
+        return *_cr2(self, cofactor, in_time=in_time), len(self.score)
 
     def _correlated(self, cofactor: Float) -> bool:
         """Whether the contributions of neighbours to the estimates go together beyond chance."""
@@ -532,12 +535,13 @@ class Clusters:
         return bool(lag * np.sqrt(len(z)) > 1.0)
 
 
-def _cr2(clusters: Clusters, cofactor: Float) -> tuple[Float, float]:
+def _cr2(clusters: Clusters, cofactor: Float, *, in_time: bool) -> tuple[Float, float]:
     """Return the bias-reduced sandwich of clusters and its degrees of freedom [bell2002].
 
     With H_c the part of the hat matrix of cluster c, A_c^T (I - H_c)^-1/2 e_c = (I - G_c C)^-1/2 A_c^T e_c: everything
     happens in the space of the parameters. The degrees of freedom are those under an error that the rows of a cluster
-    share, the mean over the parameters.
+    share, the mean over the parameters. What clusters of poses `in_time` still share with their neighbours is added
+    with the weight of Bartlett [newey1987].
     """
     free = np.flatnonzero(np.diagonal(cofactor) > 0)
     root = np.linalg.cholesky(cofactor[np.ix_(free, free)])
@@ -547,7 +551,11 @@ def _cr2(clusters: Clusters, cofactor: Float) -> tuple[Float, float]:
     inverse = (vectors / np.sqrt(np.maximum(1.0 - values, 1e-3))[:, None, :]) @ vectors.swapaxes(1, 2)
     z = (inverse @ (clusters.score[:, free] @ root)[..., None])[..., 0]
     covariance = np.zeros_like(cofactor)
-    covariance[np.ix_(free, free)] = root @ (z.T @ z) @ root.T
+    inner = z.T @ z
+    if in_time:
+        lagged = BARTLETT * (z[1:].T @ z[:-1])
+        inner = inner + lagged + lagged.T
+    covariance[np.ix_(free, free)] = root @ inner @ root.T
     ones, freedoms = clusters.ones[:, free] @ root, []
     for row in root:
         v = inverse @ row  # (C, p)

@@ -33,6 +33,9 @@ from accelcal_cli.sensor.model import ErrorModel, to_gauge
 SMALLEST_RANGE = 5.0
 """Degrees between the coldest and the warmest pose below which slopes would be extrapolated at once."""
 
+RANGE_IN_TIME = 2.5
+"""The same for poses in time, whose temperature goes up and down every day: hundreds of them tell slopes in less."""
+
 FEWEST_FOR_SLOPES = 17
 """Poses, two more than parameters."""
 
@@ -240,8 +243,9 @@ def _unsuitable(solution: Solution, degrees: Float) -> str:
         return f"more than {MOST_POSES:,} poses"
     if not np.isfinite(degrees).all():
         return f"it is missing in {int((~np.isfinite(degrees)).sum())} poses"
-    if np.ptp(degrees) < SMALLEST_RANGE:
-        return f"the poses differ by {np.ptp(degrees):.2g} degrees, and {SMALLEST_RANGE:g} are needed"
+    least = RANGE_IN_TIME if solution.stated.sample.in_time[0] else SMALLEST_RANGE
+    if np.ptp(degrees) < least:
+        return f"the poses differ by {np.ptp(degrees):.2g} degrees, and {least:g} are needed"
     if poses < FEWEST_FOR_SLOPES:
         return f"{poses} poses are too few for fifteen parameters; take at least {FEWEST_FOR_SLOPES}"
     return ""

@@ -27,7 +27,7 @@ from accelcal_cli.calibration.observability import (
 from accelcal_cli.calibration.result import Calibration, Worn
 from accelcal_cli.calibration.temperature import FEWEST_FOR_SLOPES, SMALLEST_RANGE
 from accelcal_cli.detection.detect import readings_of, screen
-from accelcal_cli.detection.intervals import Intervals
+from accelcal_cli.detection.intervals import ROUNDING, Intervals
 from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.detection.windows import Span, Tiles
 from accelcal_cli.errors import DataError
@@ -41,6 +41,9 @@ WINDOW = 10.0
 
 STILL, OWN_NOISE = 0.013, 1.2
 """Standard deviation of each axis up to which a window is at rest: in g, or as many times that of the sensor."""
+
+MOST_STILL = 0.05
+"""g: what scatters by more is no sensor at rest, however noisy."""
 
 QUIETEST = 0.02
 """Part of the windows whose noise is that of the sensor."""
@@ -134,7 +137,7 @@ class Wear:
         """Return the poses as readings that follow in time and carry the origin of the log."""
         intervals, first = self.intervals, slice(LOOKED_AT)
         readings = replace(readings_of(intervals, self.source), in_time=True)
-        said = {notice.key for notice in self.warnings}
+        said = [notice.key for notice in self.warnings]
         screened = Screened(
             intervals.mean[first],
             self.columns,
@@ -147,7 +150,8 @@ class Wear:
             scatter=intervals.scatter[first],
             behind=self.behind,
         )
-        more = [notice for notice in screened.notices() if notice.key not in said]
+        # That a watch on a table is quieter than one on a wrist needs no words.
+        more = [notice for notice in screened.notices() if notice.key not in (*said, "unequal-noise")]
         notes = (*self.notes, self.summary())
         return readings.known_as(
             self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more), self.form
@@ -199,10 +203,9 @@ def find_wear(log: RawLog, settings: WornSettings) -> Wear:
     hours = tiles.count * WINDOW / 3600.0
     whole = np.concatenate([block for _, block in tiles.blocks()])
     spread = np.sqrt(whole[:, 3:6].max(axis=1) / rows)
-    frozen = spread == 0
+    frozen = spread <= ROUNDING * np.abs(whole[:, :3]).max()
     size = _size_of_1_g(log.columns.unit, whole[:, :3], spread)
-    noise = 0.0 if frozen.all() else float(np.quantile(spread[~frozen], QUIETEST))
-    limit = max(STILL * size, OWN_NOISE * noise)
+    limit = _limit(spread[~frozen], size)
     rest = (spread <= limit) & ~frozen & (np.abs(whole[:, :3]).max(axis=1) < LARGEST * size)
     if tiles.timed:
         rest &= whole[:, -1] - whole[:, -2] <= tiles.gaps.longest
@@ -211,14 +214,7 @@ def find_wear(log: RawLog, settings: WornSettings) -> Wear:
             f"{log.name}: no window of {WINDOW:g} s in {hours:.3g} hours is at rest: the quietest scatters by "
             f"{spread.min():.4g}, and {limit:.4g} is the most that counts as rest"
         )
-    windows = RestWindows(
-        number=np.flatnonzero(rest),
-        mean=whole[rest, :3],
-        square=whole[rest, 3:6],
-        time=whole[rest, -2:] if tiles.timed else None,
-        temperature=_temperature(whole[rest, tiles.warm_at]) if tiles.warm else None,
-        rows=rows,
-    )
+    windows = _windows(tiles, whole, np.flatnonzero(rest))
     intervals, left_out = at_usual_temperature(join(windows, TILT, size), slopes=settings.slopes)
     wear = Wear(
         source=log.name,
@@ -240,6 +236,25 @@ def find_wear(log: RawLog, settings: WornSettings) -> Wear:
     )
     _check_attitudes(wear)
     return wear
+
+
+def _limit(spread: Float, size: float) -> float:
+    """Return the largest standard deviation of an axis at rest, by those of all live windows, shape (T,)."""
+    noise = float(np.quantile(spread, QUIETEST)) if len(spread) else 0.0
+    return min(max(STILL * size, OWN_NOISE * noise), MOST_STILL * size)
+
+
+def _windows(tiles: Tiles, whole: Float, at: Int) -> RestWindows:
+    """Return the windows numbered in `at`, of all that the tiles hold, shape (T, k)."""
+    rest = whole[at]
+    return RestWindows(
+        number=at,
+        mean=rest[:, :3],
+        square=rest[:, 3:6],
+        time=rest[:, -2:] if tiles.timed else None,
+        temperature=_temperature(rest[:, tiles.warm_at]) if tiles.warm else None,
+        rows=tiles.size,
+    )
 
 
 def _size_of_1_g(unit: str | None, mean: Float, spread: Float) -> float:

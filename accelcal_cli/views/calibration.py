@@ -38,14 +38,14 @@ UNKNOWN, ASSUMED = "not determined", "taken as 0"
 
 def tables(result: Calibration) -> list[Table]:
     """Return every table of a result, in reading order."""
-    of_wear = [] if result.worn is None else [worn(result.worn)]
-    return [*parameter_tables(result), *of_wear, fit(result), observability(result), worst_poses(result)]
+    return [*parameter_tables(result), fit(result), observability(result), worst_poses(result)]
 
 
 def parameter_tables(result: Calibration) -> list[Table]:
-    """Return the parameters in the paper's units, in an engineer's, and against temperature where it matters."""
+    """Return the parameters in the paper's units, in an engineer's, against temperature, and what GGIR says of wear."""
     slopes = [] if result.temperature is None else [temperature(result, result.temperature)]
-    return [parameters(result), engineering(result), *slopes]
+    of_wear = [] if result.worn is None else [worn(result.worn)]
+    return [parameters(result), engineering(result), *slopes, *of_wear]
 
 
 def blocks(result: Calibration) -> list[Block]:
