@@ -75,7 +75,8 @@ def command(
         parquet = Path(output).suffix.lower() in PARQUET
         with whole_file(output, binary=True) as file:
             log.write(file, parquet=parquet)
-        skipped = table.notes if parquet or table.rows_skipped else ()
+        rewritten = parquet or table.rows_skipped or table.source_format != "csv"
+        skipped = table.notes if rewritten else ()
     finally:
         table.close()
     sys.stdout.flush()

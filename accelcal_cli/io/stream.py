@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import codecs
 import hashlib
+import io
 import os
 import sys
 import weakref
@@ -70,8 +71,11 @@ _NATIVE = (  # first bytes of native logs that may have no zero byte soon; all o
     b"Device Identity",
 )
 
-_NOT_NATIVE = (b"PAR1", b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff")
-"""First bytes of Parquet, gzip and UTF-16, which have zero bytes and are no native logs."""
+TYPED = (b"PAR1", b"ARROW1", b"\xff\xff\xff\xff")
+"""First bytes of Parquet, and of Arrow as a file and as a stream."""
+
+_NOT_NATIVE = (*TYPED, b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff")
+"""First bytes of these, of gzip and UTF-16, which have zero bytes and are no native logs."""
 
 _Digest = Callable[[bytes], None]
 
@@ -130,7 +134,7 @@ class ByteSource:
             self._hash.update(raw)
         self.whole = len(raw) < head  # the head is all there is
         self.native = find_native(raw)
-        binary = self.native is not None or raw.startswith(b"PAR1")
+        binary = self.native is not None or raw.startswith(TYPED)
         self._carriage_returns = (
             not binary and b"\n" not in raw and b"\r" in raw[:-1]
         )  # line ends of old Macs
@@ -212,6 +216,10 @@ def open_source(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bo
     except FileNotFoundError as problem:
         raise DataError(f"{source}: no such file{_neighbour(path)}") from problem
     except IsADirectoryError as problem:
+        if (path / "metadata.yaml").is_file():
+            from accelcal_cli.io.formats.ros import BagFolder
+
+            return ByteSource(io.BufferedReader(BagFolder(path)), str(source), owned=True, hashed=hashed)
         raise DataError(f"{source}: is a directory; a file of readings was expected") from problem
     except PermissionError as problem:
         raise DataError(f"{source}: no permission to read it") from problem
@@ -291,7 +299,7 @@ def _layer(head: bytes, name: str) -> tuple[str, Callable[[ByteReader, str], Byt
         return "gzip", _Gunzipped
     if head.startswith(b"PK\x03\x04"):
         return "zip", _Member
-    if head.startswith(b"PAR1"):
+    if head.startswith(TYPED):
         return None
     encoding = _encoding(head)
     return None if encoding is None else (encoding[0], lambda stream, _: _Transcoded(stream, encoding[1]))

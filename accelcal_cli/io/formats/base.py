@@ -30,7 +30,7 @@ from accelcal_cli.io.rows import RowBlock, RowFilter
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.registry import Registry
-from accelcal_cli.schema import frozen
+from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 if TYPE_CHECKING:
     import polars as pl
@@ -46,25 +46,6 @@ TURNING = ("gx", "gy", "gz")
 """Names of the columns that native logs share, beside ``time`` and ``temperature``."""
 
 
-@frozen()
-class VehicleCorrection:
-    """What a vehicle had done to its readings before it logged them: R ((reading - offset) * scale).
-
-    Attributes:
-        system: ``px4`` or ``ardupilot``, whose parameters these are.
-        instance: number of the accelerometer, from 0; device_id: as the vehicle's parameters have it, None if unknown.
-        offset: m/s^2, shape (3,); scale: of the sensor's own axes, shape (3,).
-        rotation: R, number of MAV_SENSOR_ROTATION by which the board is turned.
-    """
-
-    system: str
-    instance: int
-    device_id: int | None
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    rotation: int = 0
-
-
 class LogFormat(ABC):
     """A native log format: found by content, read in blocks and constant memory.
 
@@ -76,7 +57,6 @@ class LogFormat(ABC):
             row lacks is NaN.
         units: of the columns, in words of `vocabulary.UNITS`: ``s``, ``g``, ``m/s^2``, ``rad/s``, ``degC``.
         facts: rate, start, serial number, range as the log states them, and the unit of the acceleration.
-        correction: what the vehicle had done to the readings, None where nothing is known of it.
     """
 
     name: ClassVar[str]
@@ -84,7 +64,6 @@ class LogFormat(ABC):
     names: tuple[str, ...]
     units: tuple[str, ...] | None = None
     facts: Facts = Facts()
-    correction: VehicleCorrection | None = None
 
     @classmethod
     @abstractmethod
@@ -108,6 +87,11 @@ class LogFormat(ABC):
     def notes(self) -> tuple[str, ...]:
         """What a user should know, in sentences; complete once all blocks have been read."""
         return ()
+
+    @property
+    def correction(self) -> VehicleCorrection | None:
+        """What a vehicle had done to the readings, None where it is none; complete once all blocks have been read."""
+        return None
 
     @abstractmethod
     def blocks(self) -> Iterator[Float]:
@@ -144,7 +128,12 @@ def choose_accelerometer(
         raise DataError(f"{source}: has no accelerometer")
     listed = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
     if wanted is not None:
-        found = [name for name in names if name.lower() == wanted.strip().lower()]
+        word = wanted.strip().lower()
+        bare = word.removesuffix("[0]")
+        found = [name for name in names if name.lower() == word]
+        alike = [name for name in names if name.lower().partition("[")[0] == bare]
+        if not found and len(alike) == 1 and (word == bare or "[" not in alike[0]):
+            found = alike  # the only one goes by its name with a number or without
         if not found:
             hint = did_you_mean(wanted, names)
             raise UsageError(
@@ -201,6 +190,14 @@ class RandomAccess:
         self._source.stop()
         self._hashing.wait()
         self._files.close()
+
+
+def cut_out(data: bytes, starts: Sequence[int], size: int) -> np.ndarray:
+    """Return the pieces of some bytes that begin at `starts` (B,), each of `size` bytes, shape (B, size), uint8."""
+    if not len(starts):
+        return np.empty((0, size), dtype=np.uint8)
+    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), size)
+    return np.asarray(windows[np.asarray(starts, dtype=np.intp)])
 
 
 def no_room(name: str, problem: OSError) -> DataError:
