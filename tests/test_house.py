@@ -14,17 +14,17 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import flow  # noqa: E402
 
-FILES, LINES = 170, 600
+FILES, LINES = 185, 600
 """135 files when the house was built; then came what makes a verdict true (attitudes, consensus, covariance, residuals,
-screening, weights, ...), the texts that devices write (clock, lines, vocabulary, ...) and their native logs, one format
-a file (formats/)."""
+screening, weights, ...), the texts that devices write (clock, lines, vocabulary, ...), their native logs, one format
+a file (formats/), and the running times of benchmarks (runtimes, profiles, bbob, peers)."""
 
 FLOW = {
     # files and pairs of files; 61 and 101 in the first version, 36 and 61 in the new house
     "calibrate": (43, 77),  # 36 and 61
     "detect": (42, 59),  # 58 and 89; 35 and 52
     "fleet": (42, 67),  # 56 and 69; 34 and 46
-    "benchmark": (28, 64),  # 59 and 64; 26 and 59
+    "benchmark": (28, 68),  # 59 and 64; 26 and 59, before hits, running times and instances
 }
 RETURNS = 155
 """How often the readings may come back to a file that they had left, between `calibrate` and the record, all branches

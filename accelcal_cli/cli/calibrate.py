@@ -23,6 +23,7 @@ SUFFIXES = (".yaml", ".yml", ".json")
 
 ROBUST = ("none", "huber", "soft-l1")
 ATTITUDES = ("unknown", "known")
+PRESETS = ("printed", "tuned")
 
 in_model, in_search = options.panel("Model"), options.panel("Search")
 
@@ -84,6 +85,14 @@ class SearchOptions:
             help="Search method: {choices}.",
             show_default="de-pso",
             autocompletion=options.one_of(options.optimizers),
+        ),
+    ] = None
+    preset: Annotated[
+        str | None,
+        in_search(
+            help="Settings of the optimizer beneath those that are stated: {choices}.",
+            show_default="its defaults",
+            autocompletion=options.one_of(PRESETS),
         ),
     ] = None
     population: Annotated[int | None, in_search(help="Points of the search.")] = None

@@ -6,7 +6,7 @@ The progress bar, the journal of finished runs beside the raw file, and the mess
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +29,18 @@ Seed = Annotated[int, in_runs("--seed", help="Seed of all random numbers.", min=
 Plot = Annotated[
     str | None,
     options.in_output("--plot", help="Draw convergence to a .png or .svg file.", metavar="FILE"),
+]
+PRESETS = ("printed", "tuned")
+"""Names of optimization.optimizer, stated again so that help need not import it; a test compares them."""
+
+Preset = Annotated[
+    str | None,
+    options.panel("Search")(
+        "--preset",
+        help="Settings of the optimizers beneath those that are stated: {choices}.",
+        show_default="each optimizer's defaults",
+        autocompletion=options.one_of(PRESETS),
+    ),
 ]
 
 
@@ -94,12 +106,18 @@ class StudyOptions:
         return partial(pools.local_pool, useful) if useful > 1 else None
 
 
-def draw_convergence(plot: str | None, title: str, curves: Curves, tolerance: float) -> None:
+def draw_convergence(
+    plot: str | None,
+    title: str,
+    curves: Curves,
+    tolerance: float,
+    bands: Callable[[], tuple[Curves, Curves]] | None = None,
+) -> None:
     """Write the picture of the median convergence where one was asked for; see `output.plot.plot_convergence`."""
     if plot is not None:
         from accelcal_cli.output.plot import plot_convergence
 
-        plot_convergence(title, curves, tolerance, plot)
+        plot_convergence(title, curves, tolerance, plot, bands() if bands else None)
 
 
 def _kept(journal: Journal) -> str:

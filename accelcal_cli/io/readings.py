@@ -344,6 +344,7 @@ class Collector:
             count=None if count is None else count[: len(first)],
             scatter=None if scatter is None else scatter[: len(first)],
             behind=self._behind,
+            zeros=bool(self.zeros.count),
         )
 
     def _line_of(self, where: Callable[[int], str]) -> Callable[[int], str]:

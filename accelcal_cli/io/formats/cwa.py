@@ -89,9 +89,9 @@ class Cwa(LogFormat):
             raise UsageError(
                 f'--accelerometer "{accelerometer}": {source.name} has one accelerometer; leave it out'
             )
-        self._batches = _batches(chain([source.head[HEADER:]], source.rest()))
+        self._cut = 0
+        self._batches = self._cut_up(chain([source.head[HEADER:]], source.rest()))
         self._read, self._broken, self._others, self._named = 0, 0, 0, list[int]()
-        self._rest = 0
         self._first = self._sound(next(self._batches, np.empty(0, LAYOUT)))
         while not len(self._first) and (batch := next(self._batches, None)) is not None:
             self._first = self._sound(batch)
@@ -131,6 +131,8 @@ class Cwa(LogFormat):
             )
         if self._others:
             notes.append(f"{plural(self._others, 'block')} of another rate or packing left out")
+        if self._cut:
+            notes.append(f"the file is cut: {plural(self._cut, 'byte')} at its end are no whole block")
         if self._clock.gaps:
             longest = f"the longest {self._clock.longest:,.4g} s"
             notes.append(f"blocks are missing at {plural(self._clock.gaps, 'place')}, {longest}")
@@ -150,6 +152,18 @@ class Cwa(LogFormat):
             if len(held):
                 yield self._rows(held, None if sound is None else float(self._starts(sound[:1])[0]))
             held = held[:0] if sound is None else sound
+
+    def _cut_up(self, parts: Iterator[bytes]) -> Iterator[Blocks]:
+        """Cut bytes into batches of blocks; what is left at the end is no block."""
+        rest = b""
+        for part in parts:
+            data = rest + part if rest else part
+            whole = len(data) // BLOCK * BLOCK
+            blocks = np.frombuffer(data, LAYOUT, whole // BLOCK)
+            for first in range(0, len(blocks), BATCH):
+                yield blocks[first : first + BATCH]
+            rest = data[whole:]
+        self._cut = len(rest)
 
     @property
     def _most(self) -> int:
@@ -210,18 +224,6 @@ class Cwa(LogFormat):
         if (count < width).any():
             flat = flat[:, (np.arange(width) < count[:, None]).ravel()]
         return flat.T
-
-
-def _batches(parts: Iterator[bytes]) -> Iterator[Blocks]:
-    """Cut bytes into batches of blocks; what is left at the end is no block."""
-    rest = b""
-    for part in parts:
-        data = rest + part if rest else part
-        whole = len(data) // BLOCK * BLOCK
-        blocks = np.frombuffer(data, LAYOUT, whole // BLOCK)
-        for first in range(0, len(blocks), BATCH):
-            yield blocks[first : first + BATCH]
-        rest = data[whole:]
 
 
 def _unpack(samples: NDArray[np.void], out: Float) -> None:

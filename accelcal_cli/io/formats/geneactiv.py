@@ -41,6 +41,7 @@ _TIME = re.compile(rb"Page Time:(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d):(\d{3})")
 _DEGREES = re.compile(rb"Temperature:([-+]?[\d.,]+)")
 _RATE = re.compile(rb"Measurement Frequency:\s*([\d.,]+)")
 _AXIS = re.compile(rb"([xyz]) (gain|offset):\s*(-?\d+)")
+_PAGES = re.compile(rb"Number of Pages:\s*(\d+)")
 _SERIAL = re.compile(rb"Device Unique Serial Code:\s*(\S+)")
 _RANGE = re.compile(rb"Accelerometer Range:\s*([^\r\n]+)")
 
@@ -84,6 +85,8 @@ class GeneActiv(LogFormat):
                 f"{self._name}: states a gain of 0 for an axis; numbers other than 0 were expected"
             )
         self._clock = PageClock(_number(rate[1]))
+        pages = _PAGES.search(header)
+        self._stated = 0 if pages is None else int(pages[1])
         self._pages = _pages(chain([source.head[top:]], source.rest()))
         self._read, self._broken, self._short, self._named = 0, 0, 0, list[int]()
         self.names = ("time", "ax", "ay", "az", "temperature")
@@ -107,6 +110,8 @@ class GeneActiv(LogFormat):
             notes.append(
                 f"{plural(self._broken, 'broken page')} left out: number {shown}{more} of {self._read:,}"
             )
+        if self._read < self._stated:
+            notes.append(f"the file is cut: it has {self._read:,} of {self._stated:,} pages")
         if self._clock.gaps:
             longest = f"the longest {self._clock.longest:,.4g} s"
             notes.append(f"pages are missing at {plural(self._clock.gaps, 'place')}, {longest}")

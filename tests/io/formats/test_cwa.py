@@ -100,6 +100,13 @@ def test_memory_that_was_never_written_is_no_fault():
     assert not any("broken" in note for note in table.notes)
 
 
+def test_a_file_that_is_cut_within_a_block_says_so():
+    data, _, _, _ = written()
+    table, rows = read(data[:-100])
+    assert len(rows) == 120 * (BLOCKS - 1)
+    assert "the file is cut: 412 bytes at its end are no whole block" in table.notes
+
+
 def test_short_blocks_and_those_of_another_rate():
     _, _, made, _ = written()
     made["count"][7] = 50
