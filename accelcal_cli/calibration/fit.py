@@ -148,16 +148,18 @@ class Fit:
     def patterns(self) -> tuple[Float, Float]:
         """P-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
 
-        NaN with known attitudes, where slopes are fitted, for poses in time, whose sigma counts with drift, and where
-        not all residuals are kept.
+        NaN with known attitudes, with slopes, for poses in time, whose sigma has drift, and where not all are kept.
         """
         poses = self.sample.poses
         every = self.residuals.pose.shape[1] >= int(poses.max())
-        if self.solution is None or self.solution.slopes is not None or not every:
+        if (
+            self.solution is None
+            or self.solution.slopes is not None
+            or not every
+            or self.sample.in_time.all()
+        ):
             return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
-        bend, drift = bend_and_drift(self.residuals, poses, self.settings.g)
-        apart = ~self.sample.in_time
-        return np.where(apart, bend, np.nan), np.where(apart, drift, np.nan)
+        return bend_and_drift(self.residuals, poses, self.settings.g)
 
     @property
     def temperature(self) -> Temperature | None:
@@ -371,10 +373,8 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
         if stated.own is not None:
             spread = spread.by_own(stated.own, stated.noise.freedom(np.ones_like(w)))
     for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses) | sample.in_time).tolist():
-        one = _clusters(solution, point, at)
-        spread.covariance[at], spread.freedom[at], clusters[at] = one.spread(
-            cofactor[at], in_time=bool(sample.in_time[at])
-        )
+        one, in_time = _clusters(solution, point, at), bool(sample.in_time[at])
+        spread.covariance[at], spread.freedom[at], clusters[at] = one.spread(cofactor[at], in_time=in_time)
     return spread, clusters
 
 

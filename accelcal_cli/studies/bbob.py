@@ -67,7 +67,9 @@ class BbobFunction(Problem):
         coco = cocoex()
         self.name = f"bbob-f{number}"
         which = f"dimensions: {dimensions} function_indices: {number}"
-        self._suite = coco.Suite("bbob", f"instances: {instance}", which)  # a suite's own instances differ by year
+        self._suite = coco.Suite(
+            "bbob", f"instances: {instance}", which
+        )  # a suite's own instances differ by year
         self._problem = self._suite.get_problem(0)
         self.lower, self.upper = (np.array(self._problem.lower_bounds), np.array(self._problem.upper_bounds))
         self.least = float(coco.BareProblem("bbob", number, dimensions, instance).best_value())
