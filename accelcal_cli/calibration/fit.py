@@ -151,13 +151,8 @@ class Fit:
         NaN with known attitudes, with slopes, for poses in time, whose sigma has drift, and where not all are kept.
         """
         poses = self.sample.poses
-        every = self.residuals.pose.shape[1] >= int(poses.max())
-        if (
-            self.solution is None
-            or self.solution.slopes is not None
-            or not every
-            or self.sample.in_time.all()
-        ):
+        told = self.residuals.pose.shape[1] >= int(poses.max()) and not self.sample.in_time.all()
+        if self.solution is None or self.solution.slopes is not None or not told:
             return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
         return bend_and_drift(self.residuals, poses, self.settings.g)
 
@@ -388,8 +383,7 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
         count, last = count + int(jumps(u, last).sum()), u[-1]
     clusters = Clusters.of(int(sample.poses[0]), count)
     for first, e, f in sample.errors(*sensor):
-        u = np.ascontiguousarray(unit(f[0]))
-        part = slice(first, first + len(u))
+        u, part = np.ascontiguousarray(unit(f[0])), slice(first, first + f.shape[1])
         w = np.ones(len(u)) if weights is None else weights[at, part]
         rows = design(u) if solution.slopes is None else solution.slopes.rows[0, part]
         clusters.add(u, rows, np.sqrt(w) * e[0], w)
