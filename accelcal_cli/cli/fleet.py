@@ -140,7 +140,7 @@ def command(
     labels: Sequence[str]
     run: Callable[[Settings, Callable[[int, Calibration], None] | None], Fleet]
     if raw:
-        logs = _Logs(columns, form, log, local_g, worn)
+        logs = _Logs(columns, form, log, local_g, worn, settings.temperature)
         logs.read(data, sensor_column)
         labels, notes, run = logs.labels, logs.told(), partial(calibrate_each, logs.readings)
         g = logs.g or settings.g
@@ -178,7 +178,7 @@ class _Logs:
 
     Attributes:
         columns, form, log, local_g: see `options.DetectionOptions.detect`.
-        worn: they are of days of wear.
+        worn: they are of days of wear; slopes: with temperature are fitted.
         labels: of the sensors; readings: the static poses of each, or why there are none.
         gravities: local gravity in the unit of each that has poses, by its number; g: in that of most of them.
         notes: what there is to say of logs, and of how many.
@@ -189,6 +189,7 @@ class _Logs:
     log: options.DetectionOptions
     local_g: Callable[[str | None], float]
     worn: bool = False
+    slopes: bool = True
     labels: list[str] = field(default_factory=list)
     readings: list[Readings | str] = field(default_factory=list)
     gravities: dict[int, float] = field(default_factory=dict)
@@ -226,7 +227,9 @@ class _Logs:
         """Find the static poses of a log."""
         if not self.worn:
             return self.log.detect(source, self.columns, self.local_g, form)
-        return wear.find(source, self.columns, self.log, self.local_g, form, misalignment=True, slopes=True)
+        return wear.find(
+            source, self.columns, self.log, self.local_g, form, misalignment=True, slopes=self.slopes
+        )
 
     def told(self) -> list[str]:
         """Return the notes, each once with the number of its logs where there are several."""
