@@ -57,58 +57,52 @@ def simulate_worn(sensor: WornSensor, days: float, rate: int, seed: int) -> Iter
     rng = np.random.default_rng(seed)
     hours = round(days * 24)
     state, direction = _plan(hours * HOUR, rng)
-    skin, wander, moved = 32.0, np.zeros(3), np.zeros(3)
-    sway = np.zeros(3)
+    skin, sway, push, drift = 32.0, np.zeros(3), np.zeros(3), np.zeros(3)
     for hour in range(hours):
         part = slice(hour * HOUR, (hour + 1) * HOUR)
-        now, n = state[part], HOUR * CONTROL
-        goal = np.where(
-            now == OFF, 21.0, 32.0 + 1.5 * np.sin(2 * np.pi * (hour + np.arange(HOUR) / HOUR) / 24)
-        )
+        now = state[part]
+        day = np.sin(2 * np.pi * (hour + np.arange(HOUR) / HOUR) / 24)
+        goal = np.where(now == OFF, 21.0, 32.0 + 1.5 * day)
         warm, _ = lfilter([1 / 1200], [1, -1 + 1 / 1200], goal, zi=[skin * (1 - 1 / 1200)])
         skin = float(warm[-1])
-        kind = np.repeat(now, CONTROL)
-        decay = np.exp(-1 / (CONTROL * 20.0))
-        sway_path, last = lfilter(
-            [np.sqrt(1 - decay**2)], [1, -decay], rng.standard_normal((n, 3)), axis=0, zi=decay * sway[None]
-        )
-        sway = last[0] / decay
-        decay = np.exp(-1 / (CONTROL * 0.3))
-        push, last = lfilter(
-            [np.sqrt(1 - decay**2)], [1, -decay], rng.standard_normal((n, 3)), axis=0, zi=decay * moved[None]
-        )
-        moved = last[0] / decay
-        u = np.repeat(direction[part], CONTROL, axis=0)
-        u = (
-            u
-            + np.where(kind == REST, 0.004, 0.0)[:, None] * sway_path
-            + np.where(kind == MOVE, 0.4, 0.0)[:, None] * push
-        )
+        kind = np.repeat(now, CONTROL)[:, None]
+        swaying, sway = _wandering(rng, HOUR * CONTROL, CONTROL * 20.0, sway)
+        pushing, push = _wandering(rng, HOUR * CONTROL, CONTROL * 0.3, push)
+        u = np.repeat(direction[part], CONTROL, axis=0) + np.where(kind == REST, 0.004, 0.0) * swaying
+        u += np.where(kind == MOVE, 0.4, 0.0) * pushing
         u /= np.linalg.norm(u, axis=1, keepdims=True)
-        u += np.where(kind == MOVE, 0.15, np.where(kind == REST, 0.001, 0.0))[:, None] * rng.standard_normal(
-            (n, 3)
+        u += np.where(kind == MOVE, 0.15, np.where(kind == REST, 0.001, 0.0)) * rng.standard_normal(u.shape)
+        drifting, drift = _wandering(rng, HOUR, sensor.wander_time, drift)
+        output = _output(
+            sensor, u, np.repeat(warm, CONTROL), np.repeat(sensor.wander * drifting, CONTROL, axis=0)
         )
-        decay = np.exp(-1 / sensor.wander_time)
-        drift, last = lfilter(
-            [sensor.wander * np.sqrt(1 - decay**2)],
-            [1, -decay],
-            rng.standard_normal((HOUR, 3)),
-            axis=0,
-            zi=decay * wander[None],
-        )
-        wander = last[0] / decay
-        t = (warm - sensor.reference)[:, None]
-        force = u @ sensor.K.T
-        slow = np.repeat(t, CONTROL, axis=0)
-        output = (1 + sensor.scale_slope * slow) * force + sensor.D + sensor.bias_slope * slow
-        output += np.repeat(drift, CONTROL, axis=0)
-        times = rate // CONTROL
-        dense = np.empty((n * times, 3))
-        follow = np.vstack([output[1:], output[-1:]])
-        for k in range(times):
-            dense[k::times] = output + (k / times) * (follow - output)
-        dense += sensor.noise * rng.standard_normal(dense.shape, dtype=np.float32)
-        yield WornChunk(dense, warm, now)
+        yield WornChunk(_dense(output, rate // CONTROL, sensor.noise, rng), warm, now)
+
+
+def _wandering(rng: np.random.Generator, n: int, steps: float, last: Float) -> tuple[Float, Float]:
+    """Return noise of unit variance that forgets within so many steps, shape (n, 3), and its last value, shape (3,)."""
+    from scipy.signal import lfilter
+
+    decay = np.exp(-1 / steps)
+    path, _ = lfilter(
+        [np.sqrt(1 - decay**2)], [1, -decay], rng.standard_normal((n, 3)), axis=0, zi=decay * last[None]
+    )
+    return path, path[-1]
+
+
+def _output(sensor: WornSensor, force: Float, degrees: Float, drift: Float) -> Float:
+    """Return the output without noise, shape (n, 3)."""
+    t = (degrees - sensor.reference)[:, None]
+    return (1 + sensor.scale_slope * t) * (force @ sensor.K.T) + sensor.D + sensor.bias_slope * t + drift
+
+
+def _dense(output: Float, times: int, noise: float, rng: np.random.Generator) -> Float:
+    """Return so many times the rows, joined by straight lines, with noise, shape (n times, 3)."""
+    dense = np.empty((len(output) * times, 3))
+    follow = np.vstack([output[1:], output[-1:]])
+    for k in range(times):
+        dense[k::times] = output + (k / times) * (follow - output)
+    return dense + noise * rng.standard_normal(dense.shape, dtype=np.float32)
 
 
 def _plan(seconds: int, rng: np.random.Generator) -> tuple[Int, Float]:
