@@ -172,7 +172,7 @@ class Wear:
         The errors are means of | |a| - 1 g | over the windows, after calibration with all that `result` has.
         """
         output, g = self.windows.mean, result.g
-        before = np.abs(np.linalg.norm(output, axis=1) / self.size - 1.0)
+        before = np.abs(np.linalg.norm(output, axis=1) / g - 1.0)
         degrees, slopes = self.windows.temperature, result.temperature
         if slopes is not None and degrees is not None:
             output = slopes.at_reference(output, degrees, result.D_a)

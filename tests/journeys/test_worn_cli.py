@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,8 @@ def test_a_worn_log_is_calibrated_with_the_figures_of_ggir(run, worn_file):
     assert worn["rest_hours"] == pytest.approx(worn["windows"] / 360)
     assert (record["data"]["source_format"], record["data"]["unit"], record["g"]) == ("cwa", "g", 1.0)
     result = load_result("wrist.json")
-    poses = find_wear(open_raw_log(worn_file), WornSettings(g=1.0)).intervals
+    with closing(open_raw_log(worn_file)) as log:
+        poses = find_wear(log, WornSettings(g=1.0)).intervals
     assert np.ptp(poses.temperature) < 2.5  # not enough for slopes
     assert np.abs(deviations(result, poses.n @ poses.temperature / poses.n.sum())).max() < 4.5
     page = run("report", "wrist.json", "-o", "wrist.html")
