@@ -27,7 +27,7 @@ import pytest
 import typer.main
 import yaml
 
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature
+from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature, Worn
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
 from accelcal_cli.cli.main import app, help_text
 from accelcal_cli.exporters.base import EXPORTERS
@@ -386,7 +386,7 @@ def test_every_name_of_the_result_is_documented():
         before + rest.partition("Each entry of `poses_fit`")[2]
     )  # keys of warnings are tested with the notices
     told = set(re.findall(r"^\| `(\w+)`", text, re.MULTILINE))
-    records = (Calibration, Sigma, Dop, PoseFit, Temperature, VehicleCorrection)
+    records = (Calibration, Sigma, Dop, PoseFit, Temperature, VehicleCorrection, Worn)
     names = {f.name for cls in records for f in dataclasses.fields(cls)}
     assert told - {f.name for f in dataclasses.fields(Notice)} == names | {"engineering"}
 

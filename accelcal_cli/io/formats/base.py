@@ -285,7 +285,7 @@ class NativeTable:
         _ = self._first
         for whole in self._rows:
             kept = whole if self.filter is None else whole[self.filter.keep_numbers(whole)]
-            numbers = kept[:, selection.numbers]
+            numbers = kept.T[list(selection.numbers)].T  # column after column: faster to reduce
             for k, column in enumerate(selection.numbers):
                 if column in last:
                     numbers[:, k] = _carried(numbers[:, k], last[column])
@@ -340,6 +340,8 @@ class NativeTable:
         self._source.close()
 
     def _check(self, numbers: Float, start: int, column: int, gaps: bool) -> None:
+        if not len(numbers) or (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
+            return
         bad = ~(np.abs(numbers) <= LIMIT) & ~(np.isnan(numbers) & gaps)
         if bad.any():
             row, value = int(np.argmax(bad)), numbers[np.argmax(bad)]
@@ -378,6 +380,8 @@ def _cell(value: float) -> str:
 
 def _carried(values: Float, last: float) -> Float:
     """Return values with each NaN replaced by the last number before it, at first `last`."""
+    if not np.isnan(values).any():
+        return values
     known = np.append(last, values)
     at = np.maximum.accumulate(np.where(np.isnan(known), 0, np.arange(len(known))))
     return known[at][1:]
