@@ -34,6 +34,7 @@ from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.notices import Notice
 from accelcal_cli.optimization.optimizer import OPTIMIZERS, PRESETS, preset_parameters
 from accelcal_cli.sensor.simulation import Sensor, Spread
+from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -385,9 +386,8 @@ def test_every_name_of_the_result_is_documented():
         before + rest.partition("Each entry of `poses_fit`")[2]
     )  # keys of warnings are tested with the notices
     told = set(re.findall(r"^\| `(\w+)`", text, re.MULTILINE))
-    names = {
-        f.name for cls in (Calibration, Sigma, Dop, PoseFit, Temperature) for f in dataclasses.fields(cls)
-    }
+    records = (Calibration, Sigma, Dop, PoseFit, Temperature, VehicleCorrection)
+    names = {f.name for cls in records for f in dataclasses.fields(cls)}
     assert told - {f.name for f in dataclasses.fields(Notice)} == names | {"engineering"}
 
 

@@ -39,7 +39,14 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, bend_and_drift, pose_residuals, worst
 from accelcal_cli.calibration.result import PoseFit, Temperature
-from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error, loss_slope, loss_weight
+from accelcal_cli.calibration.sample import (
+    NO_NOISE,
+    NOISE_TOLD,
+    Sample,
+    length_error,
+    loss_slope,
+    loss_weight,
+)
 from accelcal_cli.calibration.search import SLOPES, Search, Solution, state, unsearched
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
@@ -350,7 +357,8 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
         whole = np.zeros((1, 9 + SLOPES, 9 + SLOPES))
         whole[:, :9, :9], whole[:, 9:, 9:] = cofactor, solution.slopes.cofactor
         cofactor = whole
-    spread = plain_spread(_variance(solution, sums, freedom), cofactor, freedom)
+    part = 1.0 if _robust(solution) is None else NOISE_TOLD[stated.settings.robust]
+    spread = plain_spread(_variance(solution, sums, freedom), cofactor, part * freedom)
     clusters = np.zeros(len(sample), dtype=np.intp)
     if stated.noise is not None and solution.noise is None:
         u = directions(sample, point.lower, point.D)

@@ -339,7 +339,7 @@ class NoiseSpread:
         )
 
 
-def plain_spread(variance: Float, cofactor: Float, freedom: Int) -> NoiseSpread:
+def plain_spread(variance: Float, cofactor: Float, freedom: Float | Int) -> NoiseSpread:
     """Return the spread of poses with the same noise: s^2, shape (R,), and (A^T W A)^-1, shape (R, q, q)."""
     nothing = np.full(len(variance), np.nan)
     covariance = variance[:, None, None] * cofactor

@@ -34,6 +34,10 @@ NEEDS = {
 HUBER = 1.345
 """Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
 
+NOISE_TOLD: dict[Robust, float] = {"huber": 0.74, "soft-l1": 0.65}
+"""Degrees of freedom of s^2 under a robust loss, per one of the residuals: 2 / (J var log s^2) for normal residuals in
+units of their median. A loss that looks away from large residuals knows their size less well."""
+
 NO_NOISE = 1e-9
 """Residuals, or their standard deviation, below this part of g are rounding: readings are seldom written with ten
 digits, and no accelerometer is as quiet."""

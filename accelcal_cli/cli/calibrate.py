@@ -109,7 +109,7 @@ def command(
     data: Annotated[
         str,
         typer.Argument(
-            help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input.",
+            help="Static readings, or with --raw a log: text, Parquet, Arrow or native; - is standard input.",
             rich_help_panel="Input",
         ),
     ],

@@ -41,7 +41,7 @@ def command(
         list[str],
         typer.Argument(
             help="Table of static readings with a column that labels the sensor, or one file per sensor; with --raw "
-            "logs; CSV, text or Parquet; - is standard input.",
+            "logs; text, Parquet, Arrow or native; - is standard input.",
             rich_help_panel="Input",
         ),
     ],

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from accelcal_cli.studies.study import Record
 
 MODES = ("default", "literal", "both")
+PRIORS = ("independent", "tied")
 MAPS = ("rough", "moderate", "constant")
 ALL = "all"
 
@@ -63,6 +64,14 @@ def command(
     period: Annotated[
         float | None, in_voyage(help="Seconds between measurements.", show_default="10")
     ] = None,
+    prior: Annotated[
+        str | None,
+        in_voyage(
+            help="Initial errors of the INS: {choices}; tied by alignment and the hours before.",
+            show_default="independent",
+            autocompletion=options.one_of(PRIORS),
+        ),
+    ] = None,
     config: Annotated[
         Path | None, in_voyage(help="YAML file: voyage, INS, map, filters and their parameters.")
     ] = None,
@@ -99,9 +108,11 @@ def command(
     options.check_plot(plot)
     if mode is not None:
         options.check_choice("--mode", mode, MODES)
+    if prior is not None:
+        options.check_choice("--prior", prior, PRIORS)
     if output == "-" and format != "table":
         raise UsageError(f"-o - prints the curves; leave out --format {format}")
-    setting = options.stated(map=map, voyage=voyage, period=period)
+    setting = options.stated(map=map, voyage=voyage, period=period, prior=prior)
     limits = {"particles": particles, "generations": generations}
     repeats = options.stated(runs=runs, seed=seed)
     settings = load_study(config, {**setting, **repeats})
@@ -138,15 +149,13 @@ def _entries(
 def _calibrated(settings: NavigationSettings, source: str) -> tuple[NavigationSettings, tuple[InsGrade, ...]]:
     """Return the settings and the INS without and with a calibration.
 
-    The accelerometers are strapped down: on a platform an alignment hides their biases. Any drift is taken that the
-    filters can start with.
+    The accelerometers are strapped down: on a platform an alignment hides their biases.
     """
     from accelcal_cli.navigation.study import grade_of
 
     result = options.load_result(source)
-    free = replace(settings, plan=replace(settings.plan, drift=(0.0, settings.initial)))
     ins = replace(settings.ins, mounting="strapdown")
-    return free, (ins, grade_of(result, ins, source))
+    return settings, (ins, grade_of(result, ins, source))
 
 
 def _write(study: Navigation, records: Sequence[Record], output: str | None, plot: str | None) -> None:

@@ -172,8 +172,8 @@ class RawLog:
     @property
     def form(self) -> InputForm:
         """How the log is written; its rows are those of the detection."""
-        table = self._table
-        return InputForm(table.source_format, 0, table.rows_skipped, self.clock.rate, self.columns.unit)
+        table, unit = self._table, self.columns.unit
+        return InputForm(table.source_format, 0, table.rows_skipped, self.clock.rate, unit, table.correction)
 
     @property
     def sha256(self) -> str:

@@ -9,10 +9,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.errors import ConfigError
 from accelcal_cli.navigation.particle_filter import BLIND, Cloud, ParticleFilter, moments, normalise
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.rng import Streams
@@ -46,12 +48,18 @@ class CountedFitness:
 class EvolvingFilter(ParticleFilter):
     """A particle filter whose predicted particles are moved by an evolution.
 
-    Mode `literal` moves all particles at every epoch, by the likelihood alone, as the paper prints it. In mode
-    `default` only the worst fifth moves, only when the weights degenerate, and the fitness is the posterior: the
-    likelihood times the Gaussian of the predicted cloud, within three sigma.
+    Mode `literal` moves all particles at every epoch, as the paper prints it: by the likelihood alone, or with
+    `fitness: transition` by all of its eq. 2. In mode `default` only the worst fifth moves, only when the weights
+    degenerate, and the fitness is the posterior: the likelihood times the Gaussian of the predicted cloud, within three
+    sigma.
     """
 
     generations: int = setting(20, "of the evolution per epoch", low=0, high=1000)
+    fitness: Literal["likelihood", "transition"] = setting(
+        "likelihood",
+        "in mode literal: the likelihood alone, or times the transition density from the particle's last position, "
+        "as eq. 2 of the paper can be read",
+    )
     fraction: float = setting(0.2, "part of the particles that moves in mode default", above=0.0, high=1.0)
 
     @abstractmethod
@@ -63,6 +71,12 @@ class EvolvingFilter(ParticleFilter):
             fitness: shape (R, N).
             movers: n, how many may move; rate: fitness of positions, shape (R, n, 2).
         """
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and a fitness that would have no effect."""
+        super().__post_init__()
+        if self.mode != "literal" and self.fitness != "likelihood":
+            raise ConfigError("fitness: has no effect in mode default; set mode: literal or leave it out")
 
     @property
     def evolution(self) -> Evolution:
@@ -92,13 +106,21 @@ Move = Callable[[EvolvingFilter, Scenario, Cloud, Float, Streams], tuple[Cloud, 
 def evolve_all(
     form: EvolvingFilter, scenario: Scenario, cloud: Cloud, k: int, streams: Streams
 ) -> tuple[Cloud, float, Bool]:
-    """As printed: all particles move at every epoch, toward the likelihood alone, and are then weighed."""
-    rate = CountedFitness(lambda position: form.likelihood(scenario, k, position))
+    """As printed: all particles move at every epoch toward the fitness, and are then weighed by it."""
+    before = cloud.before if form.fitness == "transition" else None
+    likelihood = CountedFitness(lambda position: form.likelihood(scenario, k, position))
+
+    def fitness(position: Float) -> Float:
+        if before is None:
+            return likelihood(position)
+        away = np.square(position - before).sum(axis=2)
+        return likelihood(position) - 0.5 * away / form.step_noise(scenario) ** 2  # [depf2015] eq. 2
+
     x = cloud.x.copy()
-    fitness = rate(x)
-    x[..., :2] = form.evolve(x[..., :2], fitness, form.particles, rate, streams)
-    weighed = Cloud(x, cloud.log_weights + rate(x))
-    return weighed, rate.points / scenario.runs, fitness.max(axis=1) > BLIND
+    level = fitness(x[..., :2])
+    x[..., :2] = form.evolve(x[..., :2], level, form.particles, fitness, streams)
+    weighed = Cloud(x, cloud.log_weights + fitness(x[..., :2]))
+    return weighed, likelihood.points / scenario.runs, level.max(axis=1) > BLIND
 
 
 def move_worst(

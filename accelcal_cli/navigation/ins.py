@@ -178,6 +178,8 @@ class InsGrade(Checked):
     Attributes:
         accelerometer: sigma of the constant bias, micro-g.
         gyro: sigma of the constant drift, deg/h.
+        walk: random walk of the gyros, deg/sqrt(h): the other reading of Table 1, whose label says random walk, while
+            its unit says drift.
         noise: white noise of a 10 s step, as a fraction of the effect of bias and drift in that step.
         mounting: `platform`: level biases stay fixed to east and north, as in [depf2015]; `strapdown`: they turn with
             the vehicle.
@@ -185,6 +187,7 @@ class InsGrade(Checked):
 
     accelerometer: float = setting(50.0, "sigma of the constant bias, micro-g", low=0.0, high=1e6)
     gyro: float = setting(0.01, "sigma of the constant drift, deg/h", low=0.0, high=1e4)
+    walk: float = setting(0.0, "random walk of the gyros, deg/sqrt(h)", low=0.0, high=1e4)
     noise: float = setting(
         0.1, "white noise of 10 s, as a fraction of the effect of the biases in 10 s", low=0.0, high=100.0
     )
@@ -199,7 +202,9 @@ class InsGrade(Checked):
 
     def white(self) -> Float:
         """Return the noise densities of velocity and attitude: m/s (2) and rad (3) per root second."""
-        return self.noise * math.sqrt(10.0) * self.biases()
+        densities = self.noise * math.sqrt(10.0) * self.biases()
+        densities[2:] = np.hypot(densities[2:], math.radians(self.walk) / 60.0)  # sqrt(3600 s) are 60
+        return densities
 
 
 def process_noise(grade: InsGrade, step: float, position: float = 0.0) -> Float:
@@ -214,3 +219,16 @@ def process_noise(grade: InsGrade, step: float, position: float = 0.0) -> Float:
     variances[:2] = position**2
     variances[2:7] = grade.white() ** 2 * step
     return variances
+
+
+TINY = 1e-12
+"""Variance that is added to each state of a correlation matrix, so that it has a root."""
+
+
+def cholesky(P: Float) -> Float:
+    """Return lower triangular roots of covariances of very different scales, shape (..., n, n); zero variances stay."""
+    sigma = np.sqrt(np.einsum("...ii->...i", P))
+    size = np.where(sigma > 0.0, sigma, 1.0)
+    correlation = P / (size[..., :, None] * size[..., None, :])
+    correlation = 0.5 * (correlation + correlation.swapaxes(-1, -2)) + TINY * np.eye(P.shape[-1])
+    return np.asarray(np.linalg.cholesky(correlation) * sigma[..., :, None])

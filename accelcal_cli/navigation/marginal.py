@@ -16,7 +16,6 @@ Without generations the filter is a plain marginalised particle filter.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,7 +23,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.navigation.evolution import Fitness
-from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
+from accelcal_cli.navigation.ins import STATES, cholesky, metres_per_radian, process_noise
 from accelcal_cli.navigation.particle_filter import (
     BLIND,
     PositionEstimates,
@@ -51,8 +50,6 @@ BURN_IN = 0.5
 
 UNEXPLAINED = 4.0
 """Least mean misfit squared over R at which no track explains a window: by chance once in 60 000 windows of ten."""
-
-TINY = 1e-12
 
 
 def de_mc_generation(
@@ -183,14 +180,6 @@ class TrackWindow:
         return after, np.linalg.solve(after.root[:, :MOVED, :MOVED], away).swapaxes(1, 2)
 
 
-def cholesky(P: Float) -> Float:
-    """Return the Cholesky root of covariances of very different scales, shape (R, 12, 12)."""
-    sigma = np.sqrt(np.einsum("rii->ri", P))
-    correlation = P / (sigma[:, :, None] * sigma[:, None, :])
-    correlation = 0.5 * (correlation + correlation.swapaxes(1, 2)) + TINY * np.eye(STATES)
-    return np.asarray(np.linalg.cholesky(correlation) * sigma[:, :, None])
-
-
 @dataclass(frozen=True)
 class MarginalFilter:
     """The filter; see the module, and `DePf` for the settings.
@@ -209,26 +198,23 @@ class MarginalFilter:
     def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
         """Return the estimates, window by window."""
         estimates = PositionEstimates.empty(scenario)
-        root = np.tile(np.diag(np.sqrt(scenario.prior())), (scenario.runs, 1, 1))
+        root = np.tile(cholesky(scenario.prior), (scenario.runs, 1, 1))
         start = Gaussian(np.zeros((scenario.runs, STATES)), root)
-        edge = math.sqrt(3.0)  # of the uniform initial square, in sigma
-        u = edge * (2.0 * streams.uniform(self.particles, MOVED) - 1.0)
+        u: Float = streams.normal(self.particles, MOVED)
         for first in range(0, scenario.epochs, self.window):
             last = min(first + self.window, scenario.epochs)
             window = TrackWindow.predict(scenario, start, first, last)
-            start, u = self.step(window, u, edge, estimates, streams)
-            edge = math.inf
+            start, u = self.step(window, u, estimates, streams)
         return replace(estimates, lookups=float(self.particles * (1 + self.generations)))
 
     def step(
-        self, window: TrackWindow, u: Float, edge: float, estimates: PositionEstimates, streams: Streams
+        self, window: TrackWindow, u: Float, estimates: PositionEstimates, streams: Streams
     ) -> tuple[Gaussian, Float]:
         """Fill in the estimates of one window; return the Gaussian and the particles at the start of the next.
 
         Args:
             window: as predicted.
             u: particles, shape (R, N, 2).
-            edge: of the uniform prior of u, in sigma; infinite for a Gaussian prior.
             estimates: of all epochs, to fill in; streams: of the runs.
         """
         likelihoods = window.likelihoods(u, self.variance)
@@ -237,9 +223,9 @@ class MarginalFilter:
         total = likelihoods.sum(axis=1)
         misfit = -2.0 * total.max(axis=1)
         u = np.take_along_axis(u, chosen[:, :, None], axis=1)
-        u, mean, covariance = self._move(window, u, np.take_along_axis(total, chosen, axis=1), edge, streams)
+        u, mean, covariance = self._move(window, u, np.take_along_axis(total, chosen, axis=1), streams)
         wide = np.square(window.start.root[:, :2, :2]).sum(axis=(1, 2)) > window.scenario.initial**2
-        lost = (misfit > UNEXPLAINED * (window.last - window.first)) & math.isinf(edge) & ~wide
+        lost = (misfit > UNEXPLAINED * (window.last - window.first)) & (window.first > 0) & ~wide
         inflation = np.where(lost, self.recovery_inflation, 1.0)
         return window.end(u, mean, self.inflation * covariance, inflation, streams)
 
@@ -260,14 +246,12 @@ class MarginalFilter:
         return weights
 
     def _move(
-        self, window: TrackWindow, u: Float, likelihood: Float, edge: float, streams: Streams
+        self, window: TrackWindow, u: Float, likelihood: Float, streams: Streams
     ) -> tuple[Float, Float, Float]:
         """Return the particles after DE-MC, and the mean and covariance of u over its later generations."""
 
         def prior(v: Float) -> Float:
-            inside = (np.abs(v) <= edge).all(axis=2)
-            density = -0.5 * np.square(v).sum(axis=2) if math.isinf(edge) else 0.0
-            return np.where(inside, density, -np.inf)
+            return np.asarray(-0.5 * np.square(v).sum(axis=2))
 
         def rate(v: Float) -> Float:
             return np.asarray(prior(v) + window.likelihoods(v, self.variance).sum(axis=1))

@@ -8,6 +8,7 @@ The state is the position error alone, a random walk (`state: 2`), or all twelve
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
@@ -15,7 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.navigation.ins import STATES, process_noise
+from accelcal_cli.navigation.ins import STATES, cholesky, process_noise
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
@@ -157,10 +158,16 @@ def take_particles(x: Float, index: Int) -> Float:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Particles of R runs: x, metric states (R, N, D), and the logarithms of their weights, (R, N)."""
+    """Particles of R runs.
+
+    Attributes:
+        x: metric states, shape (R, N, D); log_weights: shape (R, N).
+        before: positions at the epoch before, shape (R, N, 2); None at the first epoch, and where nothing reads them.
+    """
 
     x: Float
     log_weights: Float
+    before: Float | None = None
 
 
 CHUNK = 60
@@ -196,7 +203,9 @@ class ParticleFilter(Filter):
                 F = scenario.transitions(k - 1, min(k - 1 + CHUNK, scenario.epochs))
             if k:
                 step = F[:, (k - 1) % CHUNK] if self.state == STATES else None
-                cloud = replace(cloud, x=self._propagate(scenario, cloud.x, step, streams))
+                cloud = Cloud(
+                    self._propagate(scenario, cloud.x, step, streams), cloud.log_weights, cloud.x[..., :2]
+                )
             cloud, lookups, on_map = self.update(scenario, cloud, k, streams)
             weights = normalise(cloud.log_weights)
             estimates.mean[:, k], estimates.covariance[:, k] = moments(weights, cloud.x[..., :2])
@@ -228,19 +237,23 @@ class ParticleFilter(Filter):
             return self.variance
         return scenario.noise**2 * (1.0 if self.mode == "literal" else 4.0)
 
+    def step_noise(self, scenario: Scenario) -> float:
+        """Return the noise of the position error per step. Units: m."""
+        return self.roughening * math.sqrt(scenario.period / 10.0)
+
     def degenerate(self, weights: Float) -> Bool:
         """Return which runs have too small an effective size, shape (R,)."""
         return np.asarray(effective_size(weights) < self.threshold * self.particles)
 
     def _start(self, scenario: Scenario, streams: Streams) -> Cloud:
-        """Return the particles of step 1: positions uniform in the initial square."""
-        x = streams.normal(self.particles, self.state) * np.sqrt(scenario.prior()[: self.state])
-        x[..., :2] = scenario.initial * (2.0 * streams.uniform(self.particles, 2) - 1.0)
+        """Return the particles of step 1, drawn from the prior."""
+        x = streams.normal(self.particles, self.state)
+        x = x @ cholesky(scenario.prior[: self.state, : self.state]).T
         return Cloud(x, np.zeros(x.shape[:2]))
 
     def _propagate(self, scenario: Scenario, x: Float, F: Float | None, streams: Streams) -> Float:
         """Return the particles one step on: a random walk of the position, or all errors by the transition F."""
-        rough = self.roughening * np.sqrt(scenario.period / 10.0)
+        rough = self.step_noise(scenario)
         if F is None:
             return np.asarray(x + rough * streams.normal(self.particles, 2))
         noise = streams.normal(self.particles, STATES)

@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from accelcal_cli.navigation.voyage import (
     SECONDS_PER_HOUR,
     PlannedVoyage,
     Trajectory,
+    aligned_covariance,
     ins_errors,
     wrap_angle,
 )
@@ -52,9 +54,10 @@ class Scenario:
         gravity_map: the map.
         grade: of the INS.
         noise: sigma of the gravimeter, mGal.
-        initial: the position error at the start is within this on either axis, m.
+        initial: sqrt(3) sigma of the position error at the start on either axis, m; a run further off is astray.
         ins: the indicated trajectory, its fields of shape (R, K).
         measured: gravity anomaly, mGal, shape (R, K); NaN where there is none.
+        prior: covariance of the metric states at the start, shape (12, 12): what the filters are told.
         error: true position error of the INS, m north and east, shape (R, K, 2); None when it is not known.
         true: the true trajectory, shape (K,), or the indicated one when the true one is not known.
         turns: changes of the indicated heading between epochs, clockwise, rad, shape (K - 1,). Of the heading, not of
@@ -67,6 +70,7 @@ class Scenario:
     initial: float
     ins: Trajectory
     measured: Float
+    prior: Float
     error: Float | None
     true: Trajectory
     turns: Float
@@ -108,14 +112,6 @@ class Scenario:
         after = np.minimum(np.arange(first + 1, last + 1), self.epochs - 1)
         return to_metric(F, self.ins.latitude[..., first:last], self.ins.latitude[..., after])
 
-    def prior(self) -> Float:
-        """Return the variances of the metric states at the start, shape (12,)."""
-        sigma = np.empty(STATES)
-        sigma[:2] = self.initial / math.sqrt(3.0)
-        sigma[2:4], sigma[4:6], sigma[6] = VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA
-        sigma[7:] = self.grade.biases()
-        return sigma**2
-
     def part(self, rows: Int, first: int, last: int) -> Scenario:
         """Return epochs `first` to `last` - 1 of some runs."""
         ins = self.ins
@@ -132,6 +128,18 @@ class Scenario:
         return self.gravity_map.at(latitude - north / meridian, longitude - east / parallel)
 
 
+def independent_prior(grade: InsGrade, initial: float) -> Float:
+    """Return the covariance of the metric states of which none tells of another, shape (12, 12); initial: m."""
+    sigma = np.empty(STATES)
+    sigma[:2] = initial / math.sqrt(3.0)
+    sigma[2:4], sigma[4:6], sigma[6] = VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA
+    sigma[7:] = grade.biases()
+    return np.diag(sigma**2)
+
+
+Prior = Literal["independent", "tied"]
+
+
 def simulate(
     gravity_map: GravityMap,
     plan: PlannedVoyage,
@@ -142,6 +150,7 @@ def simulate(
     period: float = 10.0,
     noise: float = 1.0,
     initial: float = 2000.0,
+    prior: Prior = "independent",
 ) -> Scenario:
     """Return simulated runs: each draws its own INS errors and its own gravimeter noise.
 
@@ -150,9 +159,17 @@ def simulate(
         plan: the voyage; grade: of the INS.
         runs: their numbers; seed: of all random numbers.
         period: between measurements, whole seconds; noise: sigma, mGal; initial: see `Scenario`.
+        prior: how the INS errors begin, see `voyage`.
     """
     every = round(period)
-    x = ins_errors(plan, grade, Streams(seed, runs, Purpose.INS), every)
+    start = plan.trajectory().at(slice(plan.start, plan.start + 1)).latitude
+    metres = np.append(np.concatenate(metres_per_radian(start)), np.ones(STATES - 2))
+    if prior == "tied":
+        radian_prior, told = None, aligned_covariance(plan, grade) * np.outer(metres, metres)
+    else:
+        told = independent_prior(grade, initial)
+        radian_prior = told / np.outer(metres, metres)
+    x = ins_errors(plan, grade, radian_prior, Streams(seed, runs, Purpose.INS), every)
     true = plan.trajectory().at(plan.start + every * np.arange(x.shape[1]))
     ins = Trajectory(
         true.seconds,
@@ -165,7 +182,7 @@ def simulate(
     error = np.stack([x[:, :, 0] * meridian, x[:, :, 1] * parallel], axis=-1)
     measured = _measure(gravity_map, true, noise, runs, seed)
     # The INS knows its heading to within the azimuth error, a milliradian.
-    return Scenario(gravity_map, grade, noise, initial, ins, measured, error, true, true.turns())
+    return Scenario(gravity_map, grade, noise, initial, ins, measured, told, error, true, true.turns())
 
 
 def _measure(gravity_map: GravityMap, true: Trajectory, noise: float, runs: range, seed: int) -> Float:
@@ -287,7 +304,8 @@ def from_recording(
     turns = wrap_angle(np.diff(np.radians(columns["heading"]))) if "heading" in columns else indicated.turns()
     parts = (indicated.latitude, indicated.longitude, indicated.east, indicated.north)
     ins = Trajectory(columns["time"], *(np.broadcast_to(part, shape) for part in parts))
-    return Scenario(gravity_map, grade, noise, initial, ins, measured, error, true, turns)
+    prior = independent_prior(grade, initial)
+    return Scenario(gravity_map, grade, noise, initial, ins, measured, prior, error, true, turns)
 
 
 def _trajectory(columns: dict[str, Float], north: str, east: str) -> Trajectory:

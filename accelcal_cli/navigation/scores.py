@@ -101,7 +101,7 @@ def bound(scenario: Scenario) -> Float:
     slope[np.isnan(slope).any(axis=1) | np.isnan(scenario.measured[0])] = 0.0
     F = replace(scenario, ins=true).transitions(0, scenario.epochs)
     Q = np.diag(process_noise(scenario.grade, scenario.period))
-    P = np.diag(scenario.prior())
+    P = scenario.prior
     out = np.empty((scenario.epochs, 2))
     for k, h in enumerate(-slope):
         gain = P[:, :2] @ h

@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -87,7 +87,13 @@ class NavigationSettings:
     ins: InsGrade = setting(InsGrade(), "the INS")
     period: float = setting(10.0, "between measurements, whole seconds", low=1.0, high=600.0)
     noise: float = setting(1.0, "of the gravimeter, one sigma, mGal", low=1e-3, high=1000.0)
-    initial: float = setting(2000.0, "the position error at the start is within this, m", above=0.0, high=1e5)
+    initial: float = setting(
+        2000.0, "sqrt(3) sigma of the position error at the start on either axis, m", above=0.0, high=1e5
+    )
+    prior: Literal["independent", "tied"] = setting(
+        "independent",
+        "initial errors: drawn one by one from what the filters are told, or tied by alignment and the hours before",
+    )
     runs: int = setting(20, "runs of each filter", low=1, high=100_000)
     seed: int = setting(0, "seed of all random numbers", low=0)
     filters: tuple[FilterEntry, ...] = ()
@@ -102,6 +108,14 @@ class NavigationSettings:
         check(self)
         if self.period != round(self.period):
             raise ConfigError(f"period: {self.period:g} s; expected whole seconds")
+        if self.voyage and self.prior == "tied":
+            raise ConfigError(
+                "prior: tied needs the hours before the first row, which a recorded voyage does not hold; leave it out"
+            )
+        if self.prior != "tied" and self.plan.drift != PlannedVoyage.drift:
+            raise ConfigError(
+                "plan: drift has no effect with prior independent; set prior: tied or leave it out"
+            )
         if not self.voyage and self.plan.seconds < self.period:
             raise ConfigError(
                 f"plan: {self.plan.seconds} s from filtered to hours; expected at least one period, {self.period:g} s, "
@@ -137,7 +151,8 @@ class NavigationSettings:
         if not self.voyage:
             check_coverage(gravity_map, self.plan.trajectory(), initial)
             return simulate(
-                gravity_map, self.plan, grade, runs=runs, seed=seed, period=self.period, noise=noise, initial=initial
+                gravity_map, self.plan, grade, runs=runs, seed=seed, period=self.period, noise=noise, initial=initial,
+                prior=self.prior,
             )  # fmt: skip
         columns = read_voyage(self.voyage, self.period)
         recorded = from_recording(

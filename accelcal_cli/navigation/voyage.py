@@ -1,9 +1,11 @@
 """A voyage: the true trajectory, and the errors of the inertial navigation system (INS) along it.
 
 The planned voyage lasts eight hours at constant speed, with a turn at hour four [depf2015] section 4. The INS errors
-follow the error model of that trajectory, integrated at 1 s by the midpoint rule. Biases are drawn at random, the tilts
-are those that a self-alignment leaves with such biases, and draws are repeated until the error after two hours is
-similar to the paper's.
+follow the error model of that trajectory, integrated at 1 s by the midpoint rule. They begin in one of two ways:
+
+- independent: at the start of the filter all twelve are drawn from the prior that the filters are given;
+- tied: biases are drawn at the start of the voyage, the tilts are those that a self-alignment leaves with such biases,
+  and both grow until the filter starts. The prior is the covariance of that.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from accelcal_cli.navigation.ins import (
     STATES,
     InsGrade,
     Motion,
+    cholesky,
     dynamics,
     metres_per_radian,
     specific_force,
@@ -34,6 +37,8 @@ NOISE_CHUNK = 600
 """Seconds of noise that are drawn at once."""
 
 TRIES = 10_000
+UNLIMITED = 1e6
+"""A drift that is not limited. Units: m."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,8 @@ class PlannedVoyage:
         heading: degrees clockwise from north; speed: m/s.
         hours: duration; filtered: hour at which the filter starts.
         turn: degrees, at the middle of the voyage; turning: its duration, s.
-        drift: limits of the INS error at the start of the filter, m.
+        drift: limits of the INS error at the start of the filter, m: draws beyond them are repeated. With other limits
+            than 0 and UNLIMITED the errors are no draws from the prior, and the bound is none.
     """
 
     latitude: float = setting(20.2, "of the start, degrees", low=-80.0, high=80.0)
@@ -57,8 +63,10 @@ class PlannedVoyage:
     turn: float = setting(-90.0, "in the middle of the voyage, degrees", low=-360.0, high=360.0)
     turning: float = setting(600.0, "duration of the turn, s", above=0.0, high=36000.0)
     drift: tuple[float, float] = setting(
-        (1000.0, 1700.0),
-        "limits of the INS error at the start of the filter, m; the paper's error is 1.35 km",
+        (0.0, UNLIMITED),
+        "limits of the INS error at the start of the filter, m, with prior tied; the paper's error is 1.35 km",
+        low=0.0,
+        high=UNLIMITED,
     )
 
     def __post_init__(self) -> None:
@@ -138,31 +146,44 @@ def _integral(rate: Float) -> Float:
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]))])
 
 
-def ins_errors(plan: PlannedVoyage, grade: InsGrade, streams: Streams, every: int) -> Float:
+def ins_errors(
+    plan: PlannedVoyage, grade: InsGrade, prior: Float | None, streams: Streams, every: int
+) -> Float:
     """Return the INS errors of each run every `every` seconds from the start of the filter, shape (R, K, 12), rad.
+
+    Args:
+        plan: the voyage; grade: of the INS.
+        prior: covariance of the errors at the start of the filter, rad, shape (12, 12), which they are drawn from.
+            None: they are those of a self-alignment at the start of the voyage and grow until the filter starts.
+        streams: of the runs; every: s.
 
     Raises:
         DataError: no draw drifts as the plan states: the INS is too good or too poor for it.
     """
     trajectory, start = plan.trajectory(), plan.start
-    F = _transitions(trajectory, grade)
-    x = _initial_errors(plan, trajectory, grade, streams, F[:start])[:, :, None]
+    F = transitions(trajectory, grade)
+    first = 0 if prior is None else start
+    x = (
+        _aligned_errors(plan, trajectory, grade, streams, F[:start])
+        if prior is None
+        else streams.normal(1, STATES)[:, 0] @ cholesky(prior).T
+    )[:, :, None]
     white = grade.white()
     errors = np.empty((len(streams), (len(F) - start) // every + 1, STATES))
-    for second in range(len(F)):
+    for second in range(first, len(F)):
         if second >= start and (second - start) % every == 0:
             errors[:, (second - start) // every] = x[:, :, 0]
-        if second % NOISE_CHUNK == 0:
+        if (second - first) % NOISE_CHUNK == 0:
             noise = streams.normal(5, min(NOISE_CHUNK, len(F) - second)) * white[:, None]
         x = F[second] @ x
-        x[:, 2:7, 0] += noise[:, :, second % NOISE_CHUNK]
+        x[:, 2:7, 0] += noise[:, :, (second - first) % NOISE_CHUNK]
     if (len(F) - start) % every == 0:
         errors[:, -1] = x[:, :, 0]
     return errors
 
 
-def _transitions(trajectory: Trajectory, grade: InsGrade) -> Float:
-    """Return the one-step transitions of the INS errors, shape (K - 1, 12, 12), by the midpoint rule."""
+def transitions(trajectory: Trajectory, grade: InsGrade) -> Float:
+    """Return the one-step transitions of the INS errors, rad, shape (K - 1, 12, 12), by the midpoint rule."""
     A = dynamics(trajectory.motion)
     middle = 0.5 * (A[1:] + A[:-1])
     h = trajectory.step
@@ -170,21 +191,46 @@ def _transitions(trajectory: Trajectory, grade: InsGrade) -> Float:
     return turn_biases(F, trajectory.turns()) if grade.mounting == "strapdown" else F
 
 
-def _initial_errors(
+def aligned_covariance(plan: PlannedVoyage, grade: InsGrade) -> Float:
+    """Return the covariance of the INS errors at the start of the filter, rad, shape (12, 12).
+
+    Definition: that of the biases, through the self-alignment and the voyage until then; nothing is known of a draw.
+    """
+    trajectory = plan.trajectory().at(slice(0, plan.start + 2))
+    F = transitions(trajectory, grade)[: plan.start]
+    align = alignment(float(specific_force(trajectory.motion)[2][0]), float(trajectory.latitude[0]))
+    root = align * grade.biases()
+    P = root @ root.T
+    noise = np.zeros((STATES, STATES))
+    noise[range(2, 7), range(2, 7)] = grade.white() ** 2
+    for step in F:
+        P = step @ P @ step.T + noise
+    return np.asarray(0.5 * (P + P.T))
+
+
+def alignment(up: float, latitude: float) -> Float:
+    """Return the errors that a self-alignment leaves of five biases, shape (12, 5); up: m/s^2; latitude: rad."""
+    out = np.zeros((STATES, 5))
+    out[4, 1], out[5, 0], out[6, 2] = -1.0 / up, 1.0 / up, 1.0 / (EARTH_RATE * math.cos(latitude))
+    out[7:] = np.eye(5)
+    return out
+
+
+def _aligned_errors(
     plan: PlannedVoyage, trajectory: Trajectory, grade: InsGrade, streams: Streams, F: Float
 ) -> Float:
-    """Return initial errors, shape (R, 12), whose drift over the transitions F is within the limits of the plan."""
+    """Return errors of an alignment, shape (R, 12), whose drift over the transitions F is within the plan's limits."""
     transition = np.eye(STATES)
     for step in F:
         transition = step @ transition
     scale = metres_per_radian(trajectory.latitude[len(F)])
-    up, latitude = float(specific_force(trajectory.motion)[2][0]), float(trajectory.latitude[0])
+    align = alignment(float(specific_force(trajectory.motion)[2][0]), float(trajectory.latitude[0]))
     low, high = plan.drift
     errors = np.empty((len(streams), STATES))
     for run in range(len(streams)):
         stream = streams.take(np.array([run]))
         for _ in range(TRIES):
-            x = _aligned(up, latitude, stream.normal(1, 5)[0, 0] * grade.biases())
+            x = align @ (stream.normal(1, 5)[0, 0] * grade.biases())
             after = transition @ x
             if low <= math.hypot(after[0] * scale[0], after[1] * scale[1]) <= high:
                 break
@@ -195,9 +241,3 @@ def _initial_errors(
             )
         errors[run] = x
     return errors
-
-
-def _aligned(up: float, latitude: float, biases: Float) -> Float:
-    """Return the errors, shape (12,), that a self-alignment leaves; `up`: specific force, m/s^2; latitude: rad."""
-    tilts = -biases[1] / up, biases[0] / up, biases[2] / (EARTH_RATE * math.cos(latitude))
-    return np.concatenate([np.zeros(4), tilts, biases])

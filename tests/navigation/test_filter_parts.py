@@ -13,7 +13,7 @@ from accelcal_cli.navigation.ins import InsGrade, metres_per_radian
 from accelcal_cli.navigation.marginal import Gaussian, MarginalFilter, TrackWindow, de_mc_generation
 from accelcal_cli.navigation.particle_filter import FILTERS, Cloud, PositionEstimates, normalise
 from accelcal_cli.navigation.scenario import simulate
-from accelcal_cli.navigation.scores import bound
+from accelcal_cli.navigation.scores import bound, score
 from accelcal_cli.navigation.voyage import PlannedVoyage
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.schema import from_mapping
@@ -52,7 +52,7 @@ def test_the_bound_is_the_covariance_of_a_kalman_filter_on_the_true_track(voyage
         / 0.02
     )
     F = dataclasses.replace(voyage, ins=true).transitions(0, voyage.epochs)
-    Q, P = step_noise(voyage.grade, voyage.period), np.diag(voyage.prior())
+    Q, P = step_noise(voyage.grade, voyage.period), voyage.prior
     expected = np.empty((voyage.epochs, 2))
     for k in range(voyage.epochs):
         h = np.r_[-slope[k], np.zeros(10)]
@@ -69,19 +69,19 @@ def test_the_bound_is_the_covariance_of_a_kalman_filter_on_the_true_track(voyage
 # The marginalised filter
 
 
-def carried_on(scenario, form, state, edge, measured=None):
+def carried_on(scenario, form, state, measured=None, first=1):
     """Return the covariance at the next window's start, the particles at its first, and the filter's scenario."""
     if measured is not None:
         scenario = dataclasses.replace(scenario, measured=measured)
     u = Streams(4, range(2)).normal(form.particles, 2)
-    window = TrackWindow.predict(scenario, state, 0, WINDOW)
-    found, _ = form.step(window, u, edge, PositionEstimates.empty(scenario), Streams(5, range(2)))
+    window = TrackWindow.predict(scenario, state, first, first + WINDOW)
+    found, _ = form.step(window, u, PositionEstimates.empty(scenario), Streams(5, range(2)))
     return found.root @ found.root.swapaxes(1, 2), u
 
 
-def predicted(scenario, root, covariance):
+def predicted(scenario, root, covariance, first=1):
     """Return the covariance after a window of Kalman predictions from root diag(covariance, I) root^T."""
-    F, Q = scenario.transitions(0, WINDOW), step_noise(scenario.grade, scenario.period)
+    F, Q = scenario.transitions(first, first + WINDOW), step_noise(scenario.grade, scenario.period)
     S = np.eye(12)
     out = []
     for r in range(scenario.runs):
@@ -95,7 +95,7 @@ def predicted(scenario, root, covariance):
 
 def start(scenario, part):
     """A Gaussian without mean, `part` of the initial sigma wide."""
-    root = part * np.tile(np.diag(np.sqrt(scenario.prior())), (scenario.runs, 1, 1))
+    root = part * np.tile(np.linalg.cholesky(scenario.prior), (scenario.runs, 1, 1))
     return Gaussian(np.zeros((scenario.runs, 12)), root)
 
 
@@ -110,26 +110,26 @@ def test_a_window_that_shows_nothing_is_a_kalman_prediction_inflated(flat, infla
     """All weights are equal: the particles are kept, and their moments are those of the start."""
     form = MarginalFilter(50, 0, WINDOW, 1.0, inflation, 4.0)
     state = start(flat, 0.5)
-    found, u = carried_on(flat, form, state, np.inf)
+    found, u = carried_on(flat, form, state)
     moments = np.array([np.cov(cloud.T, bias=True) for cloud in u])
     assert close(found, predicted(flat, state.root, inflation * moments)).all()
 
 
 @pytest.mark.parametrize(
-    ("part", "edge", "off", "grows"),
+    ("part", "first", "off", "grows"),
     [
-        (0.5, np.inf, 10.0, True),  # ten sigma off at every place
-        (0.5, np.inf, 0.0, False),
-        (0.5, np.sqrt(3.0), 10.0, False),  # the first window covers all there is
-        (2.0, np.inf, 10.0, False),  # as wide as the initial square already
+        (0.5, 1, 10.0, True),  # ten sigma off at every place
+        (0.5, 1, 0.0, False),
+        (0.5, 0, 10.0, False),  # the first window covers all there is
+        (2.0, 1, 10.0, False),  # as wide as the initial square already
     ],
 )
-def test_a_window_that_nothing_explains_widens_the_whole_covariance(flat, part, edge, off, grows):
+def test_a_window_that_nothing_explains_widens_the_whole_covariance(flat, part, first, off, grows):
     form = MarginalFilter(50, 0, WINDOW, 1.0, 1.0, 4.0)
     state = start(flat, part)
-    found, u = carried_on(flat, form, state, edge, flat.measured + off)
+    found, u = carried_on(flat, form, state, flat.measured + off, first)
     moments = np.array([np.cov(cloud.T, bias=True) for cloud in u])
-    expected = predicted(flat, state.root, moments) * (4.0 if grows else 1.0)
+    expected = predicted(flat, state.root, moments, first) * (4.0 if grows else 1.0)
     assert close(found, expected).all()
 
 
@@ -158,6 +158,14 @@ def test_a_track_that_does_not_fit_widens_the_reference(voyage):
     }
     np.testing.assert_array_equal(size[4.0][:, :120], size[1.0][:, :120])
     assert np.median(size[4.0][:, 160:]) > 4 * np.median(size[1.0][:, 160:])
+
+
+def test_estimates_that_are_no_numbers_have_diverged(voyage):
+    nowhere = PositionEstimates.empty(voyage)
+    nowhere.mean[:2] = np.nan
+    found = score(voyage, nowhere)
+    assert found.diverged[:2].all()
+    assert found.lost[:2].all()
 
 
 # The evolution

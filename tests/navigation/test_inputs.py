@@ -351,13 +351,6 @@ def test_two_measurements_are_enough_for_every_filter(tmp_path):
     assert len(json.loads(navigate("--config", path, "--format", "json", "-q"))) == len(FILTERS.names())
 
 
-def test_a_filter_that_loses_every_hypothesis_has_diverged(tmp_path):
-    path = tmp_path / "study.yaml"
-    path.write_text("runs: 2\nnoise: 1.0e-3\n")  # a gravimeter that the map is far too coarse for
-    (row,) = json.loads(navigate("--config", path, "--filter", "reference", "--format", "json", "-q"))
-    assert row["diverged"] == 2
-
-
 def test_a_voyage_of_one_measurement_is_refused(tmp_path):
     path = tmp_path / "voyage.csv"
     path.write_text("time,latitude,longitude,gravity\n0,20,115,1\n10,20,115,2\n20,20,115,3\n")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import boule
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, generate
 from accelcal_cli.navigation.ins import InsGrade, Motion, discretise, dynamics, to_metric
 from accelcal_cli.navigation.scenario import simulate
 from accelcal_cli.navigation.scores import bound, counted
-from accelcal_cli.navigation.voyage import PlannedVoyage
+from accelcal_cli.navigation.voyage import PlannedVoyage, aligned_covariance
 
 
 def at_rest(latitude: float) -> Motion:
@@ -110,16 +112,51 @@ def test_the_field_has_the_statistics_that_are_told(name, step):
     assert mean["slope"] == pytest.approx(preset.sigma / (np.sqrt(3) * preset.distance), rel=0.15)
 
 
-def test_the_ins_alone_drifts_like_the_papers(voyage):
-    start = np.hypot(*voyage.error[:, 0].T)
-    assert ((start > 990) & (start < 1710)).all()  # the paper: 1260 m and 471 m
-    later = np.sqrt(np.square(voyage.error[:, counted(voyage)]).sum(axis=2).mean())
+PAPERS = PlannedVoyage(drift=(1000.0, 1700.0))
+"""The paper's INS is 1260 m and 471 m off when the filter starts."""
+
+
+def test_a_tied_ins_drifts_as_its_plan_states(rough):
+    found = simulate(rough, PAPERS, InsGrade(), runs=range(6), seed=1, period=30.0, prior="tied")
+    start = np.hypot(*found.error[:, 0].T)
+    assert ((start > 990) & (start < 1710)).all()
+    later = np.sqrt(np.square(found.error[:, counted(found)]).sum(axis=2).mean())
     assert 2000 < later < 12000
 
 
 def test_the_drift_needs_a_fitting_ins(rough):
     with pytest.raises(DataError, match="drifts between"):
-        simulate(rough, PlannedVoyage(), InsGrade(1e-3, 1e-6), runs=range(1), seed=0)
+        simulate(rough, PAPERS, InsGrade(1e-3, 1e-6), runs=range(1), seed=0, prior="tied")
+
+
+@pytest.mark.parametrize("prior", ["independent", "tied"])
+@pytest.mark.parametrize("ins", [InsGrade(), InsGrade(gyro=0.0, walk=0.01)])
+def test_errors_are_drawn_from_the_prior_that_the_filters_are_told(rough, prior, ins):
+    """Position at the start: the mean of z' P^-1 z over 300 draws is 2 to within four sigma of that mean."""
+    plan = PlannedVoyage(hours=2.1, filtered=2.0)
+    found = simulate(rough, plan, ins, runs=range(300), seed=3, period=60.0, prior=prior)
+    error, P = found.error[:, 0], found.prior[:2, :2]
+    assert np.einsum("ri,ij,rj->r", error, np.linalg.inv(P), error).mean() == pytest.approx(2.0, abs=0.47)
+    last = found.error[:, -1]  # six minutes on, where velocities count
+    F = dataclasses.replace(found, ins=found.true).transitions(0, found.epochs)
+    Q = np.diag(earth.process_noise(ins, found.period))
+    P = found.prior
+    for k in range(found.epochs - 1):
+        P = F[k] @ P @ F[k].T + Q
+    square = np.einsum("ri,ij,rj->r", last, np.linalg.inv(P[:2, :2]), last)
+    assert square.mean() == pytest.approx(2.0, abs=0.47)
+
+
+def test_a_tied_prior_ties_tilts_to_biases():
+    P = aligned_covariance(PlannedVoyage(hours=2.1, filtered=0.0), InsGrade())
+    np.testing.assert_allclose(P[5, 7] / np.sqrt(P[5, 5] * P[7, 7]), 1.0, rtol=1e-6)
+    assert np.linalg.matrix_rank(P[4:, 4:] / np.sqrt(np.outer(P.diagonal(), P.diagonal()))[4:, 4:]) == 5
+
+
+def test_a_random_walk_of_the_gyros_is_white_noise_of_the_attitude():
+    white = InsGrade(gyro=0.0, walk=0.01, noise=0.0).white()
+    np.testing.assert_allclose(np.degrees(white[2:]) * 60.0, 0.01)  # degrees in an hour: 3600 s, root 60
+    assert (white[:2] == 0).all()
 
 
 def test_the_voyage_turns_and_stays_on_its_speed():

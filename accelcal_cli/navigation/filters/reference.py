@@ -1,7 +1,7 @@
 """The reference: a Gaussian sum of extended Kalman filters [alspach1972], which shows what is attainable.
 
-The initial square is covered by components, each a Kalman filter of all twelve errors, linearised at its own mean.
-Their weights follow from their innovations; components of negligible weight are dropped, and those that have come
+The initial position error is covered by components, each a Kalman filter of all twelve errors, linearised at its own
+mean. Their weights follow from their innovations; components of negligible weight are dropped, and those that have come
 together are merged.
 """
 
@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
-from accelcal_cli.navigation.ins import STATES, metres_per_radian, process_noise
+from accelcal_cli.navigation.ins import cholesky, metres_per_radian, process_noise
 from accelcal_cli.navigation.particle_filter import CHUNK, FILTERS, Filter, PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario
 from accelcal_cli.rng import Streams
@@ -25,6 +25,9 @@ NEGLIGIBLE = 1e-6
 COINCIDENT = 0.01
 """Squared Mahalanobis distance of the positions below which a lighter component is merged into the heaviest."""
 
+
+REACH, WIDTH = 2.2, 0.35
+"""Of the initial components: the outermost centres, in sigma of the prior, and the part of its variance in each."""
 
 MEMORY, MISFIT = 30.0, 4.0
 """A component whose mean normalised innovation squared over MEMORY measurements, 1 when all is well, exceeds MISFIT
@@ -58,7 +61,7 @@ class Bank:
 class Reference(Filter):
     """Gaussian sum of extended Kalman filters [alspach1972]; it draws no random number, and has one mode."""
 
-    components: int = setting(5, "on either axis of the initial square", low=1, high=50)
+    components: int = setting(7, "on either axis of the initial position error", low=1, high=50)
     recovery_inflation: float = setting(
         4.0,
         "of the covariance of a component whose innovations do not fit; 1: none",
@@ -87,20 +90,20 @@ class Reference(Filter):
         return replace(estimates, lookups=used / (scenario.runs * scenario.epochs))
 
     def _start(self, scenario: Scenario) -> Bank:
-        """Return equal components at the centres of the squares that tile the initial one."""
-        count = self.components
-        width = 2.0 * scenario.initial / count
-        middle = (np.arange(count) + 0.5) * width - scenario.initial
-        mean = np.zeros((count * count, STATES))
-        mean[:, 0], mean[:, 1] = np.repeat(middle, count), np.tile(middle, count)
-        variance = scenario.prior()
-        variance[:2] = width**2 / 12.0
-        runs = scenario.runs
+        """Return components whose sum is the prior: their centres lie on a square of REACH sigma of the position."""
+        count, runs, P = self.components, scenario.runs, scenario.prior
+        middle = np.linspace(-REACH, REACH, count) if count > 1 else np.zeros(1)
+        own = WIDTH if count > 1 else 1.0  # variance of a component over that of the prior
+        axes = np.repeat(middle, count), np.tile(middle, count)
+        centre = np.stack(axes, axis=1) @ cholesky(P[:2, :2]).T
+        regression = np.linalg.solve(P[:2, :2], P[:2]).T
+        variance = P - (1.0 - own) * regression @ P[:2]
+        log_weight = -0.5 * np.square(axes).sum(axis=0) / (1.0 - WIDTH)
         return Bank(
             np.repeat(np.arange(runs), count * count),
-            np.tile(mean, (runs, 1)),
-            np.tile(np.diag(variance), (runs * count * count, 1, 1)),
-            np.zeros(runs * count * count),
+            np.tile(centre @ regression.T, (runs, 1)),
+            np.tile(variance, (runs * count * count, 1, 1)),
+            np.tile(log_weight, runs),
             np.ones(runs * count * count),
         )
 
