@@ -153,7 +153,8 @@ def command(
     _check_output(output, format)
     stated_g = gravity.stated()
     log.check_raw(raw)
-    wear.check(worn, raw, log)
+    if worn:
+        wear.check(raw, log)
     stated = options.stated(**vars(model), **vars(search), g=stated_g)
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)

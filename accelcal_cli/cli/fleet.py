@@ -118,7 +118,8 @@ def command(
     options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
     log.check_raw(raw)
-    wear.check(worn, raw, log)
+    if worn:
+        wear.check(raw, log)
     stated_g = gravity.stated()
     stated = options.stated(g=stated_g, gauge=gauge, weights=weights)
     filed = {} if config is None else load_mapping(config)

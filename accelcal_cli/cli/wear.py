@@ -24,11 +24,11 @@ Worn = Annotated[
 ]
 
 
-def check(worn: bool, raw: bool, log: options.DetectionOptions) -> None:
+def check(raw: bool, log: options.DetectionOptions) -> None:
     """Refuse --worn without --raw, and options that do not go with it: raise UsageError."""
-    if worn and not raw:
+    if not raw:
         raise UsageError("--worn needs --raw")
-    for name in options.stated(**vars(log)) if worn else ():
+    for name in options.stated(**vars(log)):
         if name not in APPLY:
             raise UsageError(f"--{name.replace('_', '-')} does not apply to --worn")
 

@@ -22,7 +22,6 @@ from accelcal_cli.optimization.minimize import Stopping
 from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.studies.functions import TestFunction
-from accelcal_cli.studies.peers import needs, run_entry, suits
 from accelcal_cli.studies.runtimes import REDUCTIONS, Targeted, expected_running_time, hits_of
 from accelcal_cli.studies.study import (
     Entry,
@@ -100,7 +99,7 @@ class Benchmark(Study):
             (name, entry.label)
             for name in self.functions
             for entry in self.entries
-            if not suits(entry, self.problem(name, self.dimensions[0]))
+            if not entry.suits(self.problem(name, self.dimensions[0]))
         )
 
     def problem(self, name: str, dimensions: int, runs: Sequence[int] = (0,)) -> Problem:
@@ -139,7 +138,7 @@ class Benchmark(Study):
         watched = Targeted(problem, len(runs), (self.tolerance, *self.goals), REDUCTIONS)
         stopping = Stopping(self.tolerance if self.stop else None, evaluations)
         start = time.thread_time()
-        run = run_entry(entry, watched, runs, seed=self.seed, stopping=stopping)
+        run = entry.run(watched, runs, seed=self.seed, stopping=stopping)
         seconds = time.thread_time() - start
         hit, hits, reductions = (
             hits_of(watched, *part)
@@ -167,7 +166,7 @@ class Benchmark(Study):
             lacking = [function for function, label in self.unsuited if label == entry.label]
             if not lacking:
                 continue
-            wanted = " and ".join(NEEDS.get(need, need) for need in needs(entry))
+            wanted = " and ".join(NEEDS.get(need, need) for need in entry.needs)
             do = "does" if len(lacking) == 1 else "do"
             sentence = f"{entry.label} needs {wanted}, which {_listed(lacking)} {do} not have"
             if entry.label in named:

@@ -17,7 +17,6 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.problem import Loetters, pack, unpack
 from accelcal_cli.optimization.minimize import Run, Stopping, polish
 from accelcal_cli.sensor.model import to_gauge
-from accelcal_cli.studies.peers import run_entry
 from accelcal_cli.studies.scenarios import (
     ERRORS,
     MATRIX,
@@ -103,7 +102,7 @@ class Comparison(Study):
             start = self.space.starting_points(block.problem.box, population, runs, self.seed)
             begin = time.thread_time()
             stopping = Stopping(self.tolerance if self.stop else None, self.evaluations)
-            run = run_entry(entry, block.problem, runs, seed=self.seed, stopping=stopping, start=start)
+            run = entry.run(block.problem, runs, seed=self.seed, stopping=stopping, start=start)
             if self.polish:
                 run = _polish(block.problem, run)
             seconds = time.thread_time() - begin

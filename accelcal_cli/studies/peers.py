@@ -17,11 +17,10 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError, DataError, did_you_mean
-from accelcal_cli.optimization.minimize import Run, Stopping, minimize
+from accelcal_cli.optimization.minimize import Run
 from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import import_place
-from accelcal_cli.studies.study import Entry
 
 BUDGET = 50_000
 """Evaluations of a run when none are stated."""
@@ -262,7 +261,7 @@ def _pymoo(name: str) -> Search:
     from pymoo.core.problem import Problem as Base
     from pymoo.optimize import minimize
 
-    class Asked(Base):  # type: ignore[misc]
+    class AskedByRows(Base):  # type: ignore[misc]
         def __init__(self, f: Objective) -> None:
             super().__init__(n_var=len(f.bounds), n_obj=1, xl=f.lower, xu=f.upper)
             self.f = f
@@ -271,7 +270,7 @@ def _pymoo(name: str) -> Search:
             out["F"] = self.f.rows(x)[:, None]
 
     def search(maker: Callable[[], Any], f: Objective, seed: int) -> None:
-        minimize(Asked(f), maker(), ("n_eval", f.budget + POPULATION), seed=seed)
+        minimize(AskedByRows(f), maker(), ("n_eval", f.budget + POPULATION), seed=seed)
 
     makers = {
         "de": partial(DE, pop_size=POPULATION),
@@ -311,42 +310,10 @@ def callable_at(place: str) -> Search:
     return lambda f, seed: found(f, f.bounds, **({seeded: seed} if seeded else {}))
 
 
-def search_of(entry: Entry) -> Search:
-    """Return the search of an entry that is a peer; see `peer` and `callable_at`."""
-    library = entry.optimizer.partition(":")[0]
-    return peer(entry.optimizer) if library in LIBRARIES else callable_at(entry.optimizer)
-
-
-def run_entry(
-    entry: Entry,
-    problem: Problem,
-    runs: Sequence[int],
-    *,
-    seed: int,
-    stopping: Stopping,
-    start: Float | None = None,
-) -> Run:
-    """Return the runs of an entry on a problem, ours by `minimize` and a peer by `run_search`.
-
-    Args:
-        entry: what minimises; problem: what is minimised; runs, seed, stopping, start: as `minimize` takes them. A
-            peer draws its own starting points and heeds the budget alone.
-    """
-    if entry.peer:
-        return run_search(problem, search_of(entry), runs, seed, stopping.evaluations or BUDGET)
-    return minimize(problem, entry.build(), runs=runs, seed=seed, stopping=stopping, start=start)
-
-
-def suits(entry: Entry, problem: Problem) -> bool:
-    """Whether a problem offers what an entry needs."""
-    return all(getattr(problem, f"has_{need}") for need in needs(entry))
-
-
-def needs(entry: Entry) -> tuple[str, ...]:
-    """Return what an entry needs of a problem, see `Optimizer.needs`."""
-    if entry.peer:
-        return ("residuals",) if entry.optimizer == "scipy:least_squares" else ()
-    return entry.build().needs
+def run_peer(name: str, problem: Problem, runs: Sequence[int], seed: int, budget: int | None) -> Run:
+    """Return the runs of a peer, by LIBRARY:NAME or by the place of a callable; see `run_search`."""
+    search = peer(name) if name.partition(":")[0] in LIBRARIES else callable_at(name)
+    return run_search(problem, search, runs, seed, budget or BUDGET)
 
 
 def peer(name: str) -> Search:

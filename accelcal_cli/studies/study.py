@@ -23,7 +23,7 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.minimize import Run
+from accelcal_cli.optimization.minimize import Run, Stopping, minimize
 from accelcal_cli.optimization.optimizer import (
     OPTIMIZERS,
     Optimizer,
@@ -31,6 +31,7 @@ from accelcal_cli.optimization.optimizer import (
     preset_parameters,
     shipped_parameters,
 )
+from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import import_place
 from accelcal_cli.schema import from_mapping
 
@@ -75,6 +76,36 @@ class Entry:
         # No file may hold a colon: this was stated on the command line, and a worker has to import it again.
         find = OPTIMIZERS.imported if ":" in self.optimizer else OPTIMIZERS.get
         return from_mapping(find(self.optimizer), {**more, **self.parameters}, self.label)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What it needs of a problem, see `Optimizer.needs`."""
+        if self.peer:
+            return ("residuals",) if self.optimizer == "scipy:least_squares" else ()
+        return self.build().needs
+
+    def suits(self, problem: Problem) -> bool:
+        """Whether a problem offers what it needs."""
+        return all(getattr(problem, f"has_{need}") for need in self.needs)
+
+    def run(
+        self,
+        problem: Problem,
+        runs: Sequence[int],
+        *,
+        seed: int,
+        stopping: Stopping,
+        start: Float | None = None,
+    ) -> Run:
+        """Return its runs on a problem: arguments as `minimize` takes them.
+
+        A peer draws its own starting points and heeds the budget alone.
+        """
+        if self.peer:
+            from accelcal_cli.studies.peers import run_peer
+
+            return run_peer(self.optimizer, problem, runs, seed, stopping.evaluations)
+        return minimize(problem, self.build(), runs=runs, seed=seed, stopping=stopping, start=start)
 
 
 @dataclass(frozen=True)

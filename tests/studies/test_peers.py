@@ -12,7 +12,7 @@ import pytest
 from accelcal_cli.calibration.settings import load_settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.optimization.algorithms.de import DifferentialEvolution
-from accelcal_cli.optimization.minimize import minimize
+from accelcal_cli.optimization.minimize import Stopping, minimize
 from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.optimization.problem import FunctionProblem
 from accelcal_cli.studies import peers
@@ -165,7 +165,7 @@ def test_a_class_on_the_command_line_is_an_optimizer(own):
 def test_a_function_on_the_command_line_is_a_search(own):
     (entry,) = choose([f"{own}:walk"], None, (), Budget(evaluations=300))
     assert entry == Entry(f"{own}:walk", f"{own}:walk", peer=True)
-    run = peers.run_search(TestFunction("sphere", 3), peers.search_of(entry), [0, 1], 0, 300)
+    run = entry.run(TestFunction("sphere", 3), [0, 1], seed=0, stopping=Stopping(evaluations=300))
     assert run.evaluations.tolist() == [300, 300]
     assert run.cost[0] != run.cost[1]
     scipy = peers.callable_at("scipy.optimize:differential_evolution")
