@@ -56,8 +56,7 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     g, (N, f, w) = settings.g, _inputs(sample, settings, sample.readings(0))
     K, D, cofactor, leverage = _solved(N, f, w, g, sample.readings(0))
     free = len(f) - 4
-    left = N - f @ K.T - D
-    s, axes = _noise(K, left, w, free)
+    s, axes = _noise(K, left := N - f @ K.T - D, w, free)
     low = to_gauge(K, "lower")
     covariance, nine = _two_of_nine(K, low, cofactor, axes)
     dop = np.sqrt(np.diagonal(cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias

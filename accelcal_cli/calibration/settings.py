@@ -9,7 +9,14 @@ from typing import Any, Literal
 
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import Optimizer, State, built, preset_parameters, shipped_parameters
+from accelcal_cli.optimization.optimizer import (
+    OPTIMIZERS,
+    Optimizer,
+    State,
+    built,
+    preset_parameters,
+    shipped_parameters,
+)
 from accelcal_cli.schema import Checked, check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
@@ -133,6 +140,10 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
         stated.pop(note, None)
     merged = {**stated, **overrides}
     name = merged.get("optimizer", Settings.optimizer)
+    if ":" in str(overrides.get("optimizer", "")):
+        OPTIMIZERS.imported(str(name))  # stated on the command line: the only place that may import code
+    elif ":" in str(name):
+        raise ConfigError(f"{where}: optimizer {name}: a file imports no code; state it by --optimizer")
     own = stated.get("parameters") or {}
     if not isinstance(own, Mapping):
         raise ConfigError(f"{where}: parameters: expected a mapping of keys, not {own!r}")

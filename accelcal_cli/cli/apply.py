@@ -20,7 +20,9 @@ def command(
     result: options.ResultFile,
     data: Annotated[
         str,
-        typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.", rich_help_panel="Input"),
+        typer.Argument(
+            help="Raw log: text, Parquet, Arrow or native; - is standard input.", rich_help_panel="Input"
+        ),
     ],
     columns: options.Columns = None,
     form: options.TextOptions,

@@ -95,6 +95,7 @@ def command(
         ),
     ] = None,
     preset: running.Preset = None,
+    peer: running.Peers = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
@@ -150,7 +151,8 @@ def command(
     from accelcal_cli.studies.benchmark import Benchmark, rank, unequal_budgets
     from accelcal_cli.studies.functions import select
     from accelcal_cli.studies.study import ALL, Budget, choose, median_curves, words
-    from accelcal_cli.views.runtimes import bands, difference_table, profiles, running_time_tables
+    from accelcal_cli.views.blocks import BLANK, Paragraph
+    from accelcal_cli.views.runtimes import bands, difference_block, profiles, running_time_tables
     from accelcal_cli.views.studies import (
         benchmark_blocks,
         benchmark_table,
@@ -164,10 +166,11 @@ def command(
     options.check_plot(profile)
     if not (math.isfinite(tolerance) and tolerance >= 0):
         raise UsageError(f"--tolerance {tolerance:g}: expected zero or more")
-    named = words(optimizer or ())
+    named, peers = words(optimizer or ()), running.peer_entries(peer)
+    if not (wanted := words(func or ())) or not wanted[0].startswith("bbob"):
+        evaluations = running.peer_budget(peer, evaluations)
     budget = Budget(population, iterations, evaluations)
-    entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset)
-    wanted = words(func or ())
+    entries = choose(named, config, ("pso", "de", "de-pso", "shade-cma"), budget, preset) + peers
     study: Benchmark
     if any(name.startswith("bbob") for name in wanted):
         from accelcal_cli.studies import bbob
@@ -203,9 +206,9 @@ def command(
 
     def blocks() -> list[Block]:
         ranking = None if unequal else rank(study, records)
-        further = [*running_time_tables(study, records)]
-        if not unequal and (differences := difference_table(study, records)):
-            further.append(differences)
+        further: list[Block] = [*running_time_tables(study, records)]
+        if not unequal and (differences := difference_block(study, records)):
+            further += [differences, BLANK] if isinstance(differences, Paragraph) else [differences]
         further += [ranking_table(ranking)] if ranking else []
         return benchmark_blocks(title, rows, curves, tolerance, further)
 

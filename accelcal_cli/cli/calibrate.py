@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options, process
+from accelcal_cli.cli import options, process, wear
 from accelcal_cli.errors import UsageError
 from accelcal_cli.schema import frozen
 
@@ -106,7 +107,7 @@ def command(
     data: Annotated[
         str,
         typer.Argument(
-            help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input.",
+            help="Static readings, or with --raw a log: text, Parquet, Arrow or native; - is standard input.",
             rich_help_panel="Input",
         ),
     ],
@@ -122,6 +123,7 @@ def command(
         bool,
         options.in_log("--raw", help="The file is a raw log: find its static poses first, as detect does."),
     ] = False,
+    worn: wear.Worn = False,
     log: options.DetectionOptions,
     tolerance: Annotated[
         float | None,
@@ -151,23 +153,27 @@ def command(
     _check_output(output, format)
     stated_g = gravity.stated()
     log.check_raw(raw)
+    if worn:
+        wear.check(raw, log)
     stated = options.stated(**vars(model), **vars(search), g=stated_g)
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)
-    if raw:
-        readings = log.poses(
-            data,
-            columns,
-            lambda unit: local_g(settings, gravity, config, unit),
-            form,
-            misalignment=settings.misalignment,
-        )
+    rest = None
+    own_g = partial(local_g, settings, gravity, config)
+    if worn:
+        parts = {"misalignment": settings.misalignment, "slopes": settings.temperature}
+        rest = wear.find(data, columns, log, own_g, form, **parts)
+        readings = rest.readings()
+    elif raw:
+        readings = log.poses(data, columns, own_g, form, misalignment=settings.misalignment)
     else:
         readings = read_readings(
             data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
         )
-    settings = replace(settings, g=local_g(settings, gravity, config, readings.form.unit))
+    settings = replace(settings, g=own_g(readings.form.unit))
     result = calibrate(readings, settings)
+    if rest is not None:
+        result = replace(result, worn=rest.figures(result))
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():
         _show(result, format, output, verbose=verbose)
@@ -242,6 +248,10 @@ def _show(result: Calibration, format: str, output: str | None, *, verbose: bool
             return blocks(result)
         from accelcal_cli.views.quoted import screen
 
-        return screen(result)
+        if result.worn is None:
+            return screen(result)
+        from accelcal_cli.views.calibration import worn
+
+        return screen(result, worn(result.worn))
 
     options.print_result(format, table, shown, result.record)

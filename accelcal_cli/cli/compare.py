@@ -111,6 +111,16 @@ def command(
         ),
     ] = None,
     preset: running.Preset = None,
+    peer: running.Peers = None,
+    evaluations: Annotated[
+        int | None,
+        in_search(
+            help="Evaluations per run; the generation under way is finished.",
+            show_default="none; 50,000 with --peer",
+            min=1,
+            max=1_000_000_000,
+        ),
+    ] = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
@@ -165,7 +175,9 @@ def command(
             "(errors are always those of gauge lower)"
         )
     space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, UNKNOWNS[gauge])
-    entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations), preset)
+    peers, evaluations = running.peer_entries(peer), running.peer_budget(peer, evaluations)
+    budget = Budget(population, iterations, evaluations)
+    entries = choose(words(optimizer or ()), config, DEFAULT, budget, preset) + peers
     source: Simulation | Recording
     if data is not None:
         source = _recorded(data, columns, form, space.g, simulation)
@@ -173,7 +185,9 @@ def command(
         raise UsageError(f"--{next(iter(needless)).replace('_', '-')} needs a file of readings")
     else:
         source = simulation.scenario()
-    study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
+    study = Comparison(
+        source, space, tuple(entries), runs, seed, tolerance, polish=polish, evaluations=evaluations
+    )
     records = study_options.run(study)
     title, conditions = experiments.comparison_subject(study), experiments.comparison_conditions(study)
     rows, curves = experiments.comparison_table(study, records), median_curves(study, records)[""]

@@ -18,7 +18,7 @@ from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.engine import Executors, Journal, Progress
-    from accelcal_cli.studies.study import Curves, Record, Study
+    from accelcal_cli.studies.study import Curves, Entry, Record, Study
 
 MOST_JOBS = 1024
 RAW_SUFFIXES = (".csv", ".parquet")
@@ -42,6 +42,39 @@ Preset = Annotated[
         autocompletion=options.one_of(PRESETS),
     ),
 ]
+
+
+Peers = Annotated[
+    list[str] | None,
+    options.panel("Search")(
+        "--peer",
+        help="Optimizers of other libraries beside ours, LIBRARY:NAME as scipy:differential_evolution, pygmo:pso_gen; "
+        "all get the same evaluations.",
+        metavar="NAMES",
+    ),
+]
+
+
+def peer_entries(stated: list[str] | None) -> list[Entry]:
+    """Return the entries of the peers that are named, after a look whether there are such."""
+    if not stated:
+        return []
+    from accelcal_cli.studies.peers import peer
+    from accelcal_cli.studies.study import Entry, words
+
+    names = words(stated)
+    for name in names:
+        peer(name)
+    return [Entry(name, name, peer=True) for name in names]
+
+
+def peer_budget(stated: list[str] | None, evaluations: int | None) -> int | None:
+    """Return the evaluations of all optimizers: those that are stated, or with peers the usual 50,000."""
+    if evaluations is None and stated:
+        from accelcal_cli.studies.peers import BUDGET
+
+        return BUDGET
+    return evaluations
 
 
 @dataclass(frozen=True)

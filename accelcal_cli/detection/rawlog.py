@@ -276,9 +276,9 @@ class RawLog:
         self._table.close()
 
     def _check_time(self, time: Float, last: float, start: int) -> None:
-        back = np.diff(time, prepend=last) < 0
-        if back.any():
-            row = int(np.argmax(back))
+        back = time[1:] < time[:-1]
+        if time[0] < last or back.any():
+            row = 0 if time[0] < last else int(np.argmax(back)) + 1
             before = time[row - 1] if row else last
             single = (
                 row

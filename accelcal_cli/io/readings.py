@@ -78,6 +78,7 @@ class Readings:
         notes: what the reader did that a user should know.
         warnings: why the readings may not be what they are taken for.
         form: how the input is written.
+        in_time: whether the poses follow each other in time, so that neighbours may share errors.
     """
 
     source: str
@@ -95,6 +96,7 @@ class Readings:
     notes: tuple[str, ...] = ()
     warnings: tuple[Notice, ...] = ()
     form: InputForm = InputForm()
+    in_time: bool = False
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 

@@ -65,7 +65,10 @@ class VehicleCorrection:
                 f"{name} corrected the readings, by parameters that are not known: {self.doubt}; an export is a "
                 "correction of readings that the vehicle has corrected already"
             )
-        return f"{name} corrected the readings by its {named}{device}; --to {self.system} exports replace these numbers"
+        return (
+            f"{name} corrected the readings by its {named}{device}: a result of calibrate --raw holds these numbers, "
+            f"and --to {self.system} replaces them"
+        )
 
     def _number(self) -> int:
         return self.instance + (self.system == "ardupilot")

@@ -122,10 +122,10 @@ class Bbob(Benchmark):
         """Return the record of a task's run."""
         name, D, entry = self.problems[task.cell]
         evaluations = self.budget(D)
-        optimizer = Budget(evaluations=evaluations).limit(entry).build()
+        limited = Budget(evaluations=evaluations).limit(entry)
         problem = self._function(name, D, self.instance(task.first), self._observer(entry.label))
         try:
-            return self.timed(replace(task, last=task.first + 1), problem, optimizer, evaluations)
+            return self.timed(replace(task, last=task.first + 1), problem, limited, evaluations)
         finally:
             problem.close()
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.minimize import Stopping, minimize
-from accelcal_cli.optimization.optimizer import Optimizer, State, Status
+from accelcal_cli.optimization.minimize import Stopping
+from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.studies.functions import TestFunction
 from accelcal_cli.studies.runtimes import REDUCTIONS, Targeted, expected_running_time, hits_of
@@ -95,12 +95,11 @@ class Benchmark(Study):
     @cached_property
     def unsuited(self) -> tuple[tuple[str, str], ...]:
         """Function name and label where the function lacks what the optimizer needs."""
-        optimizers = [(entry.label, entry.build()) for entry in self.entries]
         return tuple(
-            (name, label)
+            (name, entry.label)
             for name in self.functions
-            for label, optimizer in optimizers
-            if not optimizer.suits(self.problem(name, self.dimensions[0]))
+            for entry in self.entries
+            if not entry.suits(self.problem(name, self.dimensions[0]))
         )
 
     def problem(self, name: str, dimensions: int, runs: Sequence[int] = (0,)) -> Problem:
@@ -131,17 +130,15 @@ class Benchmark(Study):
         """Return the records of a task's runs."""
         name, D, entry = self.problems[task.cell]
         runs = range(task.first, task.last)
-        return self.timed(task, self.problem(name, D, runs), entry.build(), self.evaluations)
+        return self.timed(task, self.problem(name, D, runs), entry, self.evaluations)
 
-    def timed(
-        self, task: Task, problem: Problem, optimizer: Optimizer[State], evaluations: int | None
-    ) -> list[Record]:
+    def timed(self, task: Task, problem: Problem, entry: Entry, evaluations: int | None) -> list[Record]:
         """Return the records of a task's runs on a problem, with what they reached when."""
         runs = range(task.first, task.last)
         watched = Targeted(problem, len(runs), (self.tolerance, *self.goals), REDUCTIONS)
         stopping = Stopping(self.tolerance if self.stop else None, evaluations)
         start = time.thread_time()
-        run = minimize(watched, optimizer, runs=runs, seed=self.seed, stopping=stopping)
+        run = entry.run(watched, runs, seed=self.seed, stopping=stopping)
         seconds = time.thread_time() - start
         hit, hits, reductions = (
             hits_of(watched, *part)
@@ -169,9 +166,9 @@ class Benchmark(Study):
             lacking = [function for function, label in self.unsuited if label == entry.label]
             if not lacking:
                 continue
-            needs = " and ".join(NEEDS.get(need, need) for need in entry.build().needs)
+            wanted = " and ".join(NEEDS.get(need, need) for need in entry.needs)
             do = "does" if len(lacking) == 1 else "do"
-            sentence = f"{entry.label} needs {needs}, which {_listed(lacking)} {do} not have"
+            sentence = f"{entry.label} needs {wanted}, which {_listed(lacking)} {do} not have"
             if entry.label in named:
                 raise ConfigError(sentence)
             notes.append(f"{sentence}: left out there")

@@ -15,7 +15,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.problem import Loetters, pack, unpack
-from accelcal_cli.optimization.minimize import Run, Stopping, minimize, polish
+from accelcal_cli.optimization.minimize import Run, Stopping, polish
 from accelcal_cli.sensor.model import to_gauge
 from accelcal_cli.studies.scenarios import (
     ERRORS,
@@ -52,6 +52,7 @@ class Comparison(Study):
         tolerance: a run succeeds when its cost is at most this above the least cost, (m/s^2)^4, or within 1 % of it.
         stop: whether a run ends when its cost is at or below the tolerance.
         polish: whether Levenberg-Marquardt finishes every search.
+        evaluations: budget per run; None leaves it to the iterations.
     """
 
     source: Simulation | Recording
@@ -62,6 +63,7 @@ class Comparison(Study):
     tolerance: float = 1e-10
     stop: bool = False
     polish: bool = False
+    evaluations: int | None = None
 
     @property
     def cells(self) -> int:
@@ -95,14 +97,12 @@ class Comparison(Study):
         """Return the records of a task's runs."""
         runs = range(task.first, task.last)
         with np.errstate(all="ignore"):
-            block, optimizer = self.calibrations(runs), self.entries[task.cell].build()
-            box = block.problem.box
-            start = self.space.starting_points(box, optimizer.population, runs, self.seed)
+            block, entry = self.calibrations(runs), self.entries[task.cell]
+            population = 1 if entry.peer else entry.build().population
+            start = self.space.starting_points(block.problem.box, population, runs, self.seed)
             begin = time.thread_time()
-            stopping = Stopping(self.tolerance if self.stop else None)
-            run = minimize(
-                block.problem, optimizer, runs=runs, seed=self.seed, stopping=stopping, start=start
-            )
+            stopping = Stopping(self.tolerance if self.stop else None, self.evaluations)
+            run = entry.run(block.problem, runs, seed=self.seed, stopping=stopping, start=start)
             if self.polish:
                 run = _polish(block.problem, run)
             seconds = time.thread_time() - begin

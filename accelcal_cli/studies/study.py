@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +23,7 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.minimize import Run
+from accelcal_cli.optimization.minimize import Run, Stopping, minimize
 from accelcal_cli.optimization.optimizer import (
     OPTIMIZERS,
     Optimizer,
@@ -30,6 +31,8 @@ from accelcal_cli.optimization.optimizer import (
     preset_parameters,
     shipped_parameters,
 )
+from accelcal_cli.optimization.problem import Problem
+from accelcal_cli.registry import import_place
 from accelcal_cli.schema import from_mapping
 
 ALL = "all"
@@ -58,17 +61,51 @@ class Entry:
         label: its name in the tables.
         optimizer: its name; parameters: settings that differ from its defaults.
         preset: of the optimizer, beneath the parameters; "" is none.
+        peer: whether it is of another library, or any callable that minimises as SciPy's do; see `peers`.
     """
 
     label: str = ""
     optimizer: str = ""
     parameters: dict[str, Any] = field(default_factory=dict)
     preset: str = ""
+    peer: bool = False
 
     def build(self) -> Optimizer[State]:
         """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
         more = preset_parameters(self.optimizer, self.preset) if self.preset else {}
-        return from_mapping(OPTIMIZERS.get(self.optimizer), {**more, **self.parameters}, self.label)
+        # No file may hold a colon: this was stated on the command line, and a worker has to import it again.
+        find = OPTIMIZERS.imported if ":" in self.optimizer else OPTIMIZERS.get
+        return from_mapping(find(self.optimizer), {**more, **self.parameters}, self.label)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What it needs of a problem, see `Optimizer.needs`."""
+        if self.peer:
+            return ("residuals",) if self.optimizer == "scipy:least_squares" else ()
+        return self.build().needs
+
+    def suits(self, problem: Problem) -> bool:
+        """Whether a problem offers what it needs."""
+        return all(getattr(problem, f"has_{need}") for need in self.needs)
+
+    def run(
+        self,
+        problem: Problem,
+        runs: Sequence[int],
+        *,
+        seed: int,
+        stopping: Stopping,
+        start: Float | None = None,
+    ) -> Run:
+        """Return its runs on a problem: arguments as `minimize` takes them.
+
+        A peer draws its own starting points and heeds the budget alone.
+        """
+        if self.peer:
+            from accelcal_cli.studies.peers import run_peer
+
+            return run_peer(self.optimizer, problem, runs, seed, stopping.evaluations)
+        return minimize(problem, self.build(), runs=runs, seed=seed, stopping=stopping, start=start)
 
 
 @dataclass(frozen=True)
@@ -93,6 +130,8 @@ class Budget:
         Raises:
             ConfigError: a value that the optimizer does not permit.
         """
+        if entry.peer:
+            return entry
         limits = {f.name: f.metadata for f in dataclasses.fields(OPTIMIZERS.get(entry.optimizer))}
         stated = {"population": self.population, "iterations": self.iterations}
         stated = {k: v for k, v in stated.items() if v is not None and limits[k]["low"] != limits[k]["high"]}
@@ -146,7 +185,15 @@ def choose(
 
 
 def _shipped(name: str, labels: Iterable[str], preset: str | None) -> Entry:
-    """Return an optimizer with its shipped settings and a preset; the labels of a file are named when it is unknown."""
+    """Return an optimizer with its shipped settings and a preset, or one stated as package.module:name.
+
+    When it is unknown the labels of a file are named.
+    """
+    if ":" in name:
+        found = import_place(name, "optimizer")
+        if not inspect.isclass(found) and callable(found):
+            return Entry(name, name, peer=True)
+        OPTIMIZERS.imported(name)
     try:
         OPTIMIZERS.get(name)
     except ConfigError as error:
@@ -183,6 +230,10 @@ def _entry(item: Any, where: str, preset: str | None) -> Entry:
     if not isinstance(item, Mapping) or "optimizer" not in item:
         raise ConfigError(f'{where}: expected a mapping with the key "optimizer"')
     entry = from_mapping(Entry, {key: value for key, value in item.items() if key not in NOTES}, where)
+    if entry.peer or ":" in entry.optimizer:
+        raise ConfigError(
+            f"{where}: optimizer {entry.optimizer}: a file imports no code; state it by --optimizer or --peer"
+        )
     label = entry.label or entry.optimizer
     if "," in label or label == ALL:
         raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')

@@ -58,6 +58,12 @@ ERROR_PARTS_NOTE = (
 PARAMETERS = ("K_11", "K_12", "K_13", "K_21", "K_22", "K_23", "K_31", "K_32", "K_33", "D_1", "D_2", "D_3")
 
 
+FUNCTION_COLUMNS = (
+    "function", "optimizer", "min", "lower_quartile", "median", "upper_quartile", "max", "mean", "variance",
+    "success_rate", "evaluations_to_tolerance", "ert", "runs", "evaluations", "failures", "seconds",
+)  # fmt: skip
+"""Columns of a paper's test functions, in order."""
+
 KEYS = ("function", "optimizer")
 """Columns that identify the row of ours to which a row of the paper belongs."""
 
@@ -201,6 +207,9 @@ def _part_tables(part: Part, records: Sequence[Record]) -> list[Table]:
                 else comparison_table(study, records)
             )
             further = []
+            if isinstance(study, Benchmark):
+                keys = [column.label for column in ours.columns]
+                ours = ours.with_columns(keys.index(key) for key in FUNCTION_COLUMNS)
             if isinstance(study, Comparison):
                 ours, costs = split_spread(ours)
                 further = [costs]

@@ -200,11 +200,15 @@ def summary(result: Calibration) -> str:
     return f"{result.poses:,} poses, rms of |f| - g {fall}, {gravity}"
 
 
-def screen(result: Calibration) -> list[Block]:
-    """Return what a calibration shows on one screen: verdict and what to do, parameters, fit, one line at the end."""
+def screen(result: Calibration, *further: Table) -> list[Block]:
+    """Return what a calibration shows on one screen: verdict and what to do, parameters, fit, one line at the end.
+
+    Args:
+        result: the calibration; further: tables that it has beside, as of days of wear.
+    """
     conclusion = Conclusion(result.verdict, result.reasons, result.warnings)
     last = Paragraph(f": {summary(result)}. All poses, search, observability: --verbose", result.verdict)
-    tables = [parameters(result), engineering(result), fit(result)]
+    tables = [parameters(result), engineering(result), fit(result), *further]
     return [conclusion, BLANK, *tables, *notes(result.notes), last]
 
 

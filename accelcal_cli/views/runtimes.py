@@ -12,7 +12,7 @@ from accelcal_cli.schema import frozen
 from accelcal_cli.studies.benchmark import LEVEL, Benchmark, pairwise, statistics
 from accelcal_cli.studies.runtimes import REDUCTIONS, data_profile, runtime_distribution
 from accelcal_cli.studies.study import Curves, Record, quantile_curves, records_of_cell
-from accelcal_cli.views.blocks import Column, Table
+from accelcal_cli.views.blocks import Block, Column, Paragraph, Table
 
 BUDGETS = (1.0, 10.0, 100.0, 1e3, 1e4, 1e5)
 """Evaluations over D, or over D + 1, at which the tables read the distributions."""
@@ -78,18 +78,20 @@ def profile_table(study: Benchmark, records: Sequence[Record]) -> Table:
     return Table("Data profiles", columns, tuple(rows), (note,))
 
 
-def difference_table(study: Benchmark, records: Sequence[Record]) -> Table | None:
-    """Return which optimizers differ on which function; None where there is no pair."""
+def difference_block(study: Benchmark, records: Sequence[Record]) -> Block | None:
+    """Return which optimizers differ on which function, or a sentence that none do; None where there is no pair."""
     found, tested = pairwise(study, records)
     if not tested:
         return None
+    note = (
+        "Wilcoxon's rank sum test of the costs of the runs; p for all pairs on a function by Holm's method: "
+        f"{tested - len(found)} of {tested} pairs do not differ at the {LEVEL:.0%} level."
+    )
+    if not found:
+        return Paragraph(note)
     columns = [Column("function"), Column("D", format="d", key="dimension")]
     columns += [Column("better"), Column("worse"), Column("p", format=".2g")]
     rows = tuple((d.function, d.dimension, d.better, d.worse, d.p) for d in found)
-    note = (
-        "Wilcoxon's rank sum test of the costs of the runs; p for all pairs on a function by Holm's method. "
-        f"{tested - len(found)} of {tested} pairs do not differ at the {LEVEL:.0%} level."
-    )
     table = Table("Optimizers that differ", tuple(columns), rows, (note,))
     return (
         table if len(study.dimensions) > 1 else table.with_columns(i for i in range(len(columns)) if i != 1)

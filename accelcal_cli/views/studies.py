@@ -167,7 +167,7 @@ BELOW = 1e-4
 
 
 def benchmark_blocks(
-    title: str, summary: Table, curves: Curves, tolerance: float, further: Iterable[Table]
+    title: str, summary: Table, curves: Curves, tolerance: float, further: Iterable[Block]
 ) -> list[Block]:
     """Return what a benchmark shows: table and curves of each function, then tables of all.
 

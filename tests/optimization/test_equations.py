@@ -12,6 +12,7 @@ import math
 import numpy as np
 import pytest
 
+from accelcal_cli.errors import ConfigError
 from accelcal_cli.optimization.algorithms.akpso import AdaptiveKalmanSwarm
 from accelcal_cli.optimization.algorithms.de_pso import HybridSwarm
 from accelcal_cli.optimization.algorithms.foa import FruitFly
@@ -461,3 +462,22 @@ def test_newton_converges_fails_and_keeps_a_point_whose_hessian_is_singular():
         for _ in range(1 if expected == Status.RUNNING else 3):
             state = optimizer.step(bowl, state, Streams(7, [0]))
         assert state.status.tolist() == [expected]
+
+
+def test_newton_has_converged_when_every_coordinate_of_the_step_is_small():
+    """Small is a part of the widest side of the box, here 10."""
+    problem, x = Bowl(), start(1)
+    state = Newton(population=1).init(problem, x, Streams(7, [0]))
+    step = np.abs(Newton(population=1).step(problem, state, Streams(7, [0])).x - x)[0, 0]
+    assert step.max() > 1.5 * step.min()
+    for part, expected in ((1.01, Status.CONVERGED), (0.99, Status.RUNNING)):
+        optimizer = Newton(population=1, step_tolerance=part * step.max() / 10.0)
+        assert optimizer.step(problem, state, Streams(7, [0])).status.tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"), [({"fading": 9.0}, "fading"), ({"bests": "filtered"}, "needs kalman_dim: 4")]
+)
+def test_akpso_refuses_what_it_cannot_do(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        AdaptiveKalmanSwarm(**settings)

@@ -5,9 +5,17 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from known_problems import ShiftedSphere, Watched
 
-from accelcal_cli.optimization.algorithms.shade_cma import CmaState, ShadeCma, _cma_start, _cma_step
+from accelcal_cli.optimization.algorithms.shade_cma import (
+    CmaState,
+    ShadeCma,
+    _cma_start,
+    _cma_step,
+    _Constants,
+    _step_size,
+)
 from accelcal_cli.optimization.optimizer import Status
 from accelcal_cli.rng import Streams
 
@@ -229,3 +237,42 @@ def test_the_phases_take_their_parts_of_the_budget():
                 assert used[-2] <= 500
                 assert state.x.shape == (1, expected, 4)
         assert 1000 - expected < used[-1] <= 1000
+
+
+def _phase_two(D=4, samples=8, **changes):
+    x = Streams(1, [0]).normal(20, D)
+    problem = ShiftedSphere(D)
+    return problem, dataclasses.replace(_cma_start(x, problem.cost(x), samples, 0), **changes)
+
+
+def test_many_samples_damp_more():
+    """[hansen2016] table 1: d_sigma with mu_eff above D + 2, where its square root counts."""
+    constants = _Constants.of(40, 2)
+    mu = constants.mu_eff
+    assert mu > 4
+    expected = 1 + 2 * (np.sqrt((mu - 1) / 3) - 1) + (mu + 2) / (2 + mu + 5)
+    assert constants.d_sigma == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_step_grows_where_the_best_samples_cost_the_same():
+    constants = _Constants.of(8, 4)
+    usual = np.exp(constants.c_sigma / constants.d_sigma * (3.0 / constants.chi - 1))
+    grown = usual * np.exp(0.2 + constants.c_sigma / constants.d_sigma)
+    for ranked, factor in (
+        ([1.0] * 8, grown),
+        ([1.0, 1, 1, 1, 1, 1, 2, 3], grown),  # 70 % of eight are six
+        ([1.0, 1, 1, 1, 1, 2, 2, 3], usual),
+        ([0.5, 1, 1, 1, 1, 1, 2, 3], usual),
+    ):
+        sigma = _step_size(ShiftedSphere(), np.array([0.1]), np.array([3.0]), np.array([ranked]), constants)
+        assert sigma[0] == pytest.approx(0.1 * factor, rel=1e-12)
+
+
+def test_phase_two_ends_when_the_longest_axis_underflows():
+    problem, state = _phase_two()
+    tiny = dataclasses.replace(
+        state, sigma=np.array([1e-200]), lengths=np.full((1, 4), 1e-150), C=state.C * 1e-300
+    )
+    assert _cma_step(problem, tiny, Streams(3, [0]), 10_000).status.tolist() == [Status.CONVERGED]
+    short = dataclasses.replace(state, sigma=np.array([1e-200]))
+    assert _cma_step(problem, short, Streams(3, [0]), 10_000).status.tolist() == [Status.RUNNING]

@@ -19,7 +19,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.formats.base import ACCELERATION, LOG_FORMATS, TURNING, LogFormat
+from accelcal_cli.io.formats.base import ACCELERATION, LOG_FORMATS, TURNING, LogFormat, cut_out
 from accelcal_cli.io.lines import FORCE_COLUMNS, choose_message
 from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.io.vocabulary import Facts
@@ -69,9 +69,8 @@ class _Message:
 
     def take(self, data: bytes) -> np.ndarray:
         """Return all rows of the block, a structured array of shape (B,)."""
-        starts = np.array(self.rows, dtype=np.intp) + 3
-        cells = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(self.row.itemsize)]
-        return np.asarray(cells.view(self.row)[:, 0])
+        cells = cut_out(data, self.rows, self.size)[:, 3:]
+        return np.ascontiguousarray(cells).view(self.row)[:, 0]
 
     def numbers(self, rows: np.ndarray, column: str) -> Float:
         """Return a column of some rows in its unit, shape (B,)."""

@@ -13,14 +13,21 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.formats.base import ACCELERATION, LOG_FORMATS, TURNING, LogFormat, choose_accelerometer
+from accelcal_cli.io.formats.base import (
+    ACCELERATION,
+    LOG_FORMATS,
+    TURNING,
+    LogFormat,
+    choose_accelerometer,
+    cut_out,
+)
 from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
@@ -53,6 +60,9 @@ WATCHED = (COMBINED, ACCEL, SELECTION)
 
 OF_DRIVER = {"integral_dt", "x_raw", "x_integral", "scaling"}
 """Fields of `sensor_accel` of versions before 1.11, whose drivers corrected it."""
+
+CHAIN = 4
+"""Messages in a row that are none by chance."""
 
 LARGEST = 1 << 16
 """Bytes of a row at most: the size of a message has 16 bits."""
@@ -98,8 +108,7 @@ class _Topic:
 
     def cells(self, data: bytes) -> np.ndarray:
         """Return the bytes of all rows of the block, shape (B, least)."""
-        starts = np.array(self.rows, dtype=np.intp)
-        return np.asarray(np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(self.least)])
+        return cut_out(data, self.rows, self.least)
 
     def numbers(self, cells: np.ndarray, name: str, at: int = 0) -> np.ndarray:
         """Return a number of each row, shape (B,), by the rows' bytes: of a field the one at a place."""
@@ -138,15 +147,18 @@ class _UlogScanner:
             stop = at + 3 + size
             if kind == DATA:
                 row = topics.get(data[at + 3] | data[at + 4] << 8)
-                sound = row is not None and row.least <= size - 2 <= row.size
+                if row is not None:
+                    sound = row.least <= size - 2 <= row.size
+                else:  # of a topic whose number was lost
+                    sound = size > 2 and (stop + 3 > end or data[stop + 2] in KINDS or data[stop + 2] == DATA)
             else:
                 row, sound = None, kind in KINDS and size > 0
             if sound and stop > end:
                 break
             if row is not None and sound:
                 row.rows.append(at + 5)
-            elif sound:
-                sound = self._take(kind, data[at + 3 : stop])
+            elif sound and not self._take(kind, data[at + 3 : stop]):
+                self.lost += stop - at
             if not sound:
                 if last is not None:  # a row that no message follows is damaged, too
                     last.rows.pop()
@@ -161,10 +173,21 @@ class _UlogScanner:
             if topic.name in WATCHED:
                 needles |= {struct.pack("<HBH", s + 2, DATA, number) for s in (topic.least, topic.size)}
         found = [at for needle in needles if (at := data.find(needle, start)) >= 0]
+        if len(needles) == 1:  # among the definitions
+            found += islice((at for at in range(start, len(data)) if self._is_chain(data, at)), 1)
         place = min(found, default=max(start, len(data) - len(SYNC) + 1))
         self.lost += place - start + (not self._lost_way)
         self._lost_way = not found
         return place
+
+    @staticmethod
+    def _is_chain(data: bytes, at: int) -> bool:
+        """Return whether several messages follow one another from a place on."""
+        for _ in range(CHAIN):
+            if at + 3 > len(data) or data[at + 2] not in KINDS or not (size := data[at] | data[at + 1] << 8):
+                return False
+            at += 3 + size
+        return True
 
     def _take(self, kind: int, body: bytes) -> bool:
         """Take what a message says; return False for one that makes no sense."""
@@ -236,6 +259,7 @@ class Px4Log(LogFormat):
         self._scanner, self._cut = _UlogScanner(), 0
         self._origin: int | None = None
         self._devices: set[int] = set()
+        self._warm: Float = np.empty((0, 2))  # time and temperature that were logged last
         self._scanned = self._scan(source)
         self._first = next(self._scanned, b"")
         able = {self._called(topic): topic for topic in self._accelerometers()}
@@ -268,8 +292,14 @@ class Px4Log(LogFormat):
         if combined and "gyro_rad" in self._topic.places:
             self._columns += [("gyro_rad", k) for k in range(3)]
             names, units = [*names, *TURNING], [*units, *["rad/s"] * 3]
-        if "temperature" in self._topic.places:
-            self._columns.append(("temperature", 0))
+        own = "temperature" in self._topic.places
+        self._columns += [("temperature", 0)] * own
+        self._thermometers = [
+            topic
+            for topic in (self._accelerometers() if combined else [])
+            if topic.name == ACCEL and {"temperature", "device_id"} <= topic.places.keys()
+        ]
+        if own or self._thermometers:
             names, units = [*names, "temperature"], [*units, "degC"]
         self.names, self.units = tuple(names), tuple(units)
 
@@ -282,7 +312,21 @@ class Px4Log(LogFormat):
             if len(times) and self._origin is None:
                 self._origin = int(times[0])
             columns = [self._topic.numbers(cells, name, at) for name, at in self._columns]
+            if self._thermometers:
+                columns.append(self._temperature(data, times))
             yield np.column_stack([(times - (self._origin or 0)) / 1e6, *columns])
+
+    def _temperature(self, data: bytes, times: Int) -> Float:
+        """Return the temperature of the combined device at some times, (B,): the last before them, NaN without one."""
+        device, known = self._device(), [self._warm]
+        for topic in self._thermometers:
+            cells = topic.cells(data)
+            parts = [topic.numbers(cells, name).astype(float) for name in ("timestamp", "temperature")]
+            known.append(np.column_stack(parts)[topic.numbers(cells, "device_id") == device])
+        rows = np.concatenate(known)
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        self._warm = rows[-1:]
+        return np.append(np.nan, rows[:, 1])[np.searchsorted(rows[:, 0], times, side="right")]
 
     def _scan(self, source: ByteSource) -> Iterator[bytes]:
         """Scan the log; yield each block, whose rows the scanner's topics know until the next is asked for.
