@@ -114,7 +114,8 @@ def evolve_all(
         if before is None:
             return likelihood(position)
         away = np.square(position - before).sum(axis=2)
-        return likelihood(position) - 0.5 * away / form.step_noise(scenario) ** 2  # [depf2015] eq. 2
+        prior: Float = 0.5 * away / form.step_noise(scenario) ** 2  # [depf2015] eq. 2
+        return likelihood(position) - prior
 
     x = cloud.x.copy()
     level = fitness(x[..., :2])

@@ -205,7 +205,7 @@ def _read_grid(path: str, suffix: str) -> GravityMap:
         package: Any = importlib.import_module(needed)
     except ImportError:
         raise DataError(
-            f"{path}: needs {needed}: pip install 'accelcal[maps]' (XYZ text needs no package)"
+            f"{path}: needs {needed}: python -m pip install xarray rioxarray netCDF4 (XYZ text needs no package)"
         ) from None
     try:
         if suffix in GEOTIFF:
