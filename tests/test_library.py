@@ -87,7 +87,7 @@ def test_a_table_of_any_kind_gives_the_numbers_of_the_file(kind, sample):
     frame = pl.read_csv(SAMPLE)
     if kind == "pandas":
         pandas = pytest.importorskip("pandas")
-        data = pandas.read_csv(SAMPLE, float_precision="round_trip")
+        data = pandas.DataFrame({name: frame[name].to_numpy() for name in frame.columns})
     elif kind == "arrow":
         pytest.importorskip("pyarrow")
         data = frame.to_arrow()
@@ -110,7 +110,8 @@ def test_an_array_gives_the_numbers_of_its_file(tmp_path):
 
 def test_text_columns_of_pandas_label_the_poses(sample):
     pandas = pytest.importorskip("pandas")
-    frame = pandas.read_csv(SAMPLE, dtype={"pose": str}, float_precision="round_trip")
+    table = pl.read_csv(SAMPLE)
+    frame = pandas.DataFrame({name: table[name].to_numpy() for name in table.columns}).astype({"pose": str})
     assert np.array_equal(accelcal.calibrate(frame).K_a, sample.K_a)
     broken = frame.assign(pose=[None, *frame["pose"][1:]])
     with pytest.raises(DataError, match='row 1, column "pose": is empty'):
