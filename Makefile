@@ -10,13 +10,14 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 unexport PIP_USER PIP_TARGET PIP_PREFIX PIP_ROOT PIP_NO_DEPS PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION
 unexport PIP_IGNORE_INSTALLED PIP_PYTHON PIP_REPORT PYTHONPATH PYTHONHOME
 
-.PHONY: help demo test hunt lint types bench docs truth golden pictures clean
+.PHONY: help demo test hunt mutants lint types bench docs truth golden pictures clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo     install into .venv and calibrate the simulated sample"
 	@echo "make test     run the tests"
 	@echo "make hunt     write one table in 10 000 ways and look for misreadings; COUNT=100000 for more"
+	@echo "make mutants  break the optimizers in 200 ways and look whether the tests notice; COUNT=1000 for more"
 	@echo "make lint     ruff"
 	@echo "make types    mypy"
 	@echo "make bench    run the benchmarks; ARGS=optimizers only those of the optimizers"
@@ -32,9 +33,11 @@ demo: $(VENV)/installed
 test: $(VENV)/installed-test
 	$(BIN)/python -m pytest -n auto $(ARGS)
 
-COUNT ?= 10000
 hunt: $(VENV)/installed-test
-	$(BIN)/python tests/hunt.py $(COUNT)
+	$(BIN)/python tests/hunt.py $(or $(COUNT),10000)
+
+mutants: $(VENV)/installed-test
+	$(BIN)/python tests/mutants.py $(or $(COUNT),200)
 
 lint: $(VENV)/installed-lint
 	$(BIN)/ruff check .

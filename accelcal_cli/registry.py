@@ -105,6 +105,22 @@ class Registry(Generic[T]):
             self.register(name)(self._load(self._entry_points[name]))
         return self._classes.get(name)
 
+    def imported(self, place: str) -> type[T]:
+        """Return the class at `package.module:Class`, entered under that name.
+
+        This runs somebody's code: only what a user states on the command line may come here, nothing from a file. The
+        current folder is looked in, too.
+
+        Raises:
+            ConfigError: it cannot be imported, or is no complete class of the kind.
+        """
+        if place in self._classes:
+            return self._classes[place]
+        found = import_place(place, self.kind)
+        if not (inspect.isclass(found) and issubclass(found, self.base)) or inspect.isabstract(found):
+            raise ConfigError(f"{self.kind} {place}: not a complete subclass of {self.base.__name__}")
+        return self.register(place)(cast(type[T], found))
+
     def is_built_in(self, cls: type) -> bool:
         """Return whether a class is one of ours, and not of an installed package."""
         return cls.__module__.startswith(f"{self.package}.")
@@ -138,6 +154,18 @@ class Registry(Generic[T]):
         if not (inspect.isclass(cls) and issubclass(cls, self.base)) or inspect.isabstract(cls):
             raise ConfigError(f"{place}: {point.value} is not a complete subclass of {self.base.__name__}")
         return cast(type[T], cls)
+
+
+def import_place(place: str, kind: str) -> object:
+    """Return what stands at `package.module:name`, in the current folder or installed; see `Registry.imported`."""
+    module, _, name = place.partition(":")
+    if str(Path.cwd()) not in sys.path and "" not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (Exception, SystemExit) as error:  # whatever somebody else's module does when it is imported
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{kind} {place}: cannot be imported ({type(error).__name__}: {reason})") from None
 
 
 @cache

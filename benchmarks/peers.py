@@ -1,6 +1,6 @@
 """The other tools that `benchmarks.optimizers` measures, each as a job: one whole search.
 
-pip install pyswarms scikit-opt scipy mealpy pygmo fcmaes
+pip install pyswarms scikit-opt scipy mealpy pygmo fcmaes pymoo
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from accelcal_cli.arrays import Float
 from accelcal_cli.studies.functions import TestFunction
 
 POPULATION, ITERATIONS, D = 100, 500, 12
-PSO = {"w": 0.7298, "c1": 1.49618, "c2": 1.49618}
+PSO_WEIGHT = 0.7298
+PSO = {"w": PSO_WEIGHT, "c1": 1.49618, "c2": 1.49618}
 
 Job = Callable[[], object]
 """One whole search. Its evaluations are counted by its Objective, or else it returns their number."""
@@ -93,6 +94,23 @@ def mealpy_pso(objective: Objective) -> Job:
     return lambda: swarm.OriginalPSO(epoch=ITERATIONS, pop_size=POPULATION).solve(task)
 
 
+def pymoo(objective: Objective, name: str) -> Job:
+    from pymoo.algorithms.soo.nonconvex.de import DE
+    from pymoo.algorithms.soo.nonconvex.pso import PSO
+    from pymoo.core.problem import Problem
+    from pymoo.optimize import minimize
+
+    class Asked(Problem):
+        def __init__(self) -> None:
+            super().__init__(n_var=D, n_obj=1, xl=objective.lower, xu=objective.upper)
+
+        def _evaluate(self, x: Float, out: dict[str, Float], *_: Any, **__: Any) -> None:
+            out["F"] = objective.rows(x)[:, None]
+
+    maker = {"pso": partial(PSO, adaptive=False, w=PSO_WEIGHT, c1=1.49618, c2=1.49618), "de": DE}[name]
+    return lambda: minimize(Asked(), maker(pop_size=POPULATION), ("n_gen", ITERATIONS), seed=1)
+
+
 def fcmaes(objective: Objective, name: str) -> Job:
     from fcmaes import cmaescpp, decpp
     from scipy.optimize import Bounds
@@ -157,6 +175,8 @@ PYTHON: dict[str, Callable[[Objective], Job]] = {
     "scikit-opt DE": partial(scikit_opt, name="de"),
     "SciPy DE": scipy_de,
     "mealpy PSO": mealpy_pso,
+    "pymoo PSO": partial(pymoo, name="pso"),
+    "pymoo DE": partial(pymoo, name="de"),
     "pygmo pso, point by point": partial(pygmo_python, name="pso"),
     "pygmo pso_gen, batched": partial(pygmo_python, name="pso_gen"),
     "pygmo de, point by point": partial(pygmo_python, name="de"),

@@ -201,6 +201,9 @@ def circles(edges: dict[str, set[str]]) -> list[str]:
     ]
 
 
+RANDOM = "uses numpy's global or unseeded random numbers"
+
+
 def forbidden_calls(root: Path) -> list[str]:
     """Printing, exiting and global random numbers in the library (everything below output/ and cli/)."""
     found = []
@@ -211,6 +214,8 @@ def forbidden_calls(root: Path) -> list[str]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             text = ast.unparse(node) if isinstance(node, ast.Call | ast.Raise | ast.Attribute) else ""
             fault = _fault(node, text)
+            if fault == RANDOM and path.match("studies/peers.py"):
+                continue  # it runs other libraries, some of which know no other stream
             if fault and not (unit == "output" and fault == "writes to a terminal"):
                 found.append(f"{path.relative_to(root)}:{node.lineno}: {text} {fault}")
     return found
@@ -229,5 +234,5 @@ def _fault(node: ast.AST, text: str) -> str:
         if text in ("sys.stdout", "sys.stderr"):
             return "writes to a terminal"
         if text.startswith(("np.random.", "numpy.random.")) and node.attr.islower():
-            return "uses numpy's global or unseeded random numbers"
+            return RANDOM
     return ""

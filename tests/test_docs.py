@@ -27,13 +27,14 @@ import pytest
 import typer.main
 import yaml
 
-from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature
+from accelcal_cli.calibration.result import Calibration, Dop, PoseFit, Sigma, Temperature, Worn
 from accelcal_cli.calibration.settings import BoxSettings, Nominal, Settings
 from accelcal_cli.cli.main import app, help_text
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.notices import Notice
-from accelcal_cli.optimization.optimizer import OPTIMIZERS
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, PRESETS, preset_parameters
 from accelcal_cli.sensor.simulation import Sensor, Spread
+from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -41,7 +42,7 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)(?: +(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 GENERATED = re.compile(
-    r"(<!-- (options|keys|parameters|optimizers|exporters): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL
+    r"(<!-- (options|keys|parameters|presets|optimizers|exporters): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL
 )
 SYMBOL = re.compile(r" \((\w+(?:, or \w+)?)\)|(?<=S-curve): (\w)$")
 """The symbol of a setting in its description."""
@@ -275,6 +276,16 @@ def parameter_table(name: str) -> str:
     return "\n".join(rows) + "\n"
 
 
+def preset_table(name: str) -> str:
+    """Return what the presets of an optimizer set, one a row."""
+    rows = ["| preset | sets |", "| --- | --- |"]
+    for preset in PRESETS:
+        stated = preset_parameters(name, preset)
+        said = ", ".join(f"`{key}: {list(v) if isinstance(v, tuple) else v}`" for key, v in stated.items())
+        rows.append(f"| `{preset}` | {said or 'nothing: the defaults'} |")
+    return "\n".join(rows) + "\n"
+
+
 def optimizer_table(_: str) -> str:
     """Return the optimizers with family, paper and what they are, one a row."""
     rows = ["| name | family | paper | what it is |", "| --- | --- | --- | --- |"]
@@ -326,6 +337,7 @@ TABLES = {
     "options": option_table,
     "keys": key_table,
     "parameters": parameter_table,
+    "presets": preset_table,
     "optimizers": optimizer_table,
     "exporters": exporter_table,
 }
@@ -374,9 +386,8 @@ def test_every_name_of_the_result_is_documented():
         before + rest.partition("Each entry of `poses_fit`")[2]
     )  # keys of warnings are tested with the notices
     told = set(re.findall(r"^\| `(\w+)`", text, re.MULTILINE))
-    names = {
-        f.name for cls in (Calibration, Sigma, Dop, PoseFit, Temperature) for f in dataclasses.fields(cls)
-    }
+    records = (Calibration, Sigma, Dop, PoseFit, Temperature, VehicleCorrection, Worn)
+    names = {f.name for cls in records for f in dataclasses.fields(cls)}
     assert told - {f.name for f in dataclasses.fields(Notice)} == names | {"engineering"}
 
 
@@ -415,6 +426,7 @@ def test_every_optimizer_has_a_page_with_the_equations_of_its_source(name):
     cls = OPTIMIZERS.get(name)
     assert text.startswith(f"# {name}\n")
     assert f"<!-- parameters: {name} -->" in text
+    assert f"<!-- presets: {name} -->" in text
     assert f"[{cls.paper}]" in text
     for file in sources(cls.__module__.rpartition(".")[2]):
         for key, numbers in EQUATION.findall(file.read_text("utf-8")):

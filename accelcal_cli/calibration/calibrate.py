@@ -149,7 +149,10 @@ def _number(value: float) -> float | None:
 
 def _origin(readings: Readings) -> dict[str, object]:
     named = {"source": readings.source, "sha256": readings.sha256, "columns": list(readings.columns)}
-    return {**named, **asdict(readings.form)}
+    form = asdict(readings.form)
+    if form["correction"] is None:
+        del form["correction"]
+    return {**named, **form}
 
 
 def _nine_of(geometry: Float, view: Float) -> Float:

@@ -2,8 +2,9 @@
 
 Up to a quarter of the poses may be wrong by any factor. Ellipsoids through random subsets of the poses are each judged
 by the smaller three quarters of their squared residuals; the best are refined by fitting those poses again until
-nothing changes (least trimmed squares with concentration steps [rousseeuw2006]). From the best one the agreeing poses
-grow: a pose that the others would not call an outlier joins them.
+nothing changes (least trimmed squares with concentration steps [rousseeuw2006]). From each of these the agreeing poses
+grow: a pose that the others would not call an outlier joins them. The most likely of the results is the consensus: the
+least trimmed sum alone takes up wrong poses that sound ones happen to agree with.
 """
 
 from __future__ import annotations
@@ -41,6 +42,9 @@ OPEN = 1e-15
 TRIMMED = 0.607
 """Standard deviation of the smaller three quarters of normal residuals, over that of all."""
 
+SPREAD = 0.5 * np.log(2.0 * np.pi * np.e)
+"""-log likelihood of a normal value of standard deviation 1, on average."""
+
 
 def consensus(sample: Sample, settings: Settings) -> Bool | None:
     """Return which poses of one sensor agree, shape (J,); None where they are too few to tell, or none do."""
@@ -58,8 +62,19 @@ def consensus(sample: Sample, settings: Settings) -> Bool | None:
     if len(x) > LOOKED_AT:
         looked = np.sort(np.argsort(random.uniform(1, len(x))[0, 0], kind="stable")[:LOOKED_AT])
     terms = _terms(x[looked])[:, columns]  # in the order of the parameters that they determine
-    subset = _best_subset(terms, random)
-    return None if subset is None else _grown(x, looked[subset], columns)
+    grown = [
+        _grown(x[looked], subset, columns, scale)
+        for subset in _best_subsets(terms, random)
+        for scale in (TRIMMED, 1.0)
+    ]
+    found = [one for one in grown if one is not None and one[1].sum() >= len(columns) + SPARE]
+    if not found:
+        return None
+    agreeing = min(found, key=lambda one: one[0])[1]
+    if len(looked) < len(x):
+        whole = _grown(x, looked[agreeing], columns, 1.0)
+        return None if whole is None else whole[1]
+    return agreeing
 
 
 def _terms(x: Float) -> Float:
@@ -99,8 +114,8 @@ def _errors(terms: Float, y: Float) -> Float:
     return np.where(sound[:, None], e, np.inf)
 
 
-def _best_subset(terms: Float, random: Streams) -> Int | None:
-    """Return the numbers of the three quarters of the rows that agree best, or None."""
+def _best_subsets(terms: Float, random: Streams) -> list[Int]:
+    """Return the numbers of the three quarters of the rows that agree best, of several searches, each once."""
     poses, free = terms.shape
     most = poses - poses // WRONG
     order = np.argsort(random.uniform(SUBSETS, poses)[0], axis=1, kind="stable")
@@ -120,21 +135,24 @@ def _best_subset(terms: Float, random: Streams) -> Int | None:
         objective = value
         member = np.zeros((len(inner), poses))
         np.put_along_axis(member, inner, 1.0, axis=1)
-    at = int(np.argmin(objective))
-    return np.flatnonzero(member[at]) if np.isfinite(objective[at]) else None
+    return [np.flatnonzero(one) for one in np.unique(member[np.isfinite(objective)], axis=0)]
 
 
-def _grown(x: Float, start: Int, columns: Int) -> Bool | None:
-    """Return which of all rows agree, shape (J,), from those that surely do; None where these fix no ellipsoid.
+def _grown(x: Float, start: Int, columns: Int, scale: float) -> tuple[float, Bool] | None:
+    """Return which of all rows agree with those that surely do, shape (J,), behind how unlikely that is.
 
     Args:
         x: readings, shape (J, 3); start: numbers of rows that agree; columns: of the free parameters.
+        scale: what the standard deviation of the residuals of `start` is over that of all sound rows.
+
+    Returns:
+        -log likelihood of the residuals: normal ones of rows that agree, of others anything from s to g, evenly by its
+        logarithm; None where the rows fix no ellipsoid.
     """
     poses, free = len(x), len(columns)
     terms = _terms(x)[:, columns]
     agreeing = np.zeros(poses, dtype=bool)
     agreeing[start] = True
-    scale = TRIMMED
     for _ in range(STEPS):
         count = int(agreeing.sum())
         y = _solved(terms, agreeing[None].astype(float))
@@ -151,7 +169,8 @@ def _grown(x: Float, start: Int, columns: Int) -> Bool | None:
         if (grown == agreeing).all():
             break
         agreeing = grown
-    return agreeing
+    wrong = 2.0 * np.abs(e[~agreeing]) * max(np.log(1.0 / s), 1.0)
+    return float((count - free) * (np.log(s) + SPREAD) + np.log(wrong).sum()), agreeing
 
 
 def _leverage(x: Float, y: Float, agreeing: Bool, columns: Int) -> Float:

@@ -39,7 +39,14 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.residuals import KEPT, PoseResiduals, bend_and_drift, pose_residuals, worst
 from accelcal_cli.calibration.result import PoseFit, Temperature
-from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error, loss_slope, loss_weight
+from accelcal_cli.calibration.sample import (
+    NO_NOISE,
+    NOISE_TOLD,
+    Sample,
+    length_error,
+    loss_slope,
+    loss_weight,
+)
 from accelcal_cli.calibration.search import SLOPES, Search, Solution, state, unsearched
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
@@ -141,11 +148,11 @@ class Fit:
     def patterns(self) -> tuple[Float, Float]:
         """P-values of residuals that bend with the direction, and that drift from pose to pose, shape (R,) each.
 
-        NaN with known attitudes, where slopes are fitted, and where not all residuals are kept.
+        NaN with known attitudes, with slopes, for poses in time, whose sigma has drift, and where not all are kept.
         """
         poses = self.sample.poses
-        every = self.residuals.pose.shape[1] >= int(poses.max())
-        if self.solution is None or self.solution.slopes is not None or not every:
+        told = self.residuals.pose.shape[1] >= int(poses.max()) and not self.sample.in_time.all()
+        if self.solution is None or self.solution.slopes is not None or not told:
             return np.full(len(poses), np.nan), np.full(len(poses), np.nan)
         return bend_and_drift(self.residuals, poses, self.settings.g)
 
@@ -350,7 +357,8 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
         whole = np.zeros((1, 9 + SLOPES, 9 + SLOPES))
         whole[:, :9, :9], whole[:, 9:, 9:] = cofactor, solution.slopes.cofactor
         cofactor = whole
-    spread = plain_spread(_variance(solution, sums, freedom), cofactor, freedom)
+    part = 1.0 if _robust(solution) is None else NOISE_TOLD[stated.settings.robust]
+    spread = plain_spread(_variance(solution, sums, freedom), cofactor, part * freedom)
     clusters = np.zeros(len(sample), dtype=np.intp)
     if stated.noise is not None and solution.noise is None:
         u = directions(sample, point.lower, point.D)
@@ -359,11 +367,9 @@ def _spread(solution: Solution, point: _Point, sums: Float) -> tuple[NoiseSpread
         spread = scattered_spread(spread, rows, w, cofactor, stated.noise, freedom)
         if stated.own is not None:
             spread = spread.by_own(stated.own, stated.noise.freedom(np.ones_like(w)))
-    for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses)).tolist():
-        one = _clusters(solution, point, at)
-        covariance, own, clusters[at] = one.spread(cofactor[at, :9, :9])
-        spread.covariance[at, :9, 9:], spread.covariance[at, 9:, :9] = 0.0, 0.0
-        spread.covariance[at, :9, :9], spread.freedom[at] = covariance, own
+    for at in np.flatnonzero(autocorrelated(sums[6], sums[2], sample.poses) | sample.in_time).tolist():
+        one, in_time = _clusters(solution, point, at), bool(sample.in_time[at])
+        spread.covariance[at], spread.freedom[at], clusters[at] = one.spread(cofactor[at], in_time=in_time)
     return spread, clusters
 
 
@@ -377,9 +383,10 @@ def _clusters(solution: Solution, point: _Point, at: int) -> Clusters:
         count, last = count + int(jumps(u, last).sum()), u[-1]
     clusters = Clusters.of(int(sample.poses[0]), count)
     for first, e, f in sample.errors(*sensor):
-        u = unit(f[0])
-        w = np.ones(len(u)) if weights is None else weights[at, first : first + len(u)]
-        clusters.add(np.ascontiguousarray(u), np.sqrt(w) * e[0], w)
+        u, part = np.ascontiguousarray(unit(f[0])), slice(first, first + f.shape[1])
+        w = np.ones(len(u)) if weights is None else weights[at, part]
+        rows = design(u) if solution.slopes is None else solution.slopes.rows[0, part]
+        clusters.add(u, rows, np.sqrt(w) * e[0], w)
     return clusters
 
 

@@ -56,7 +56,7 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
     g, (N, f, w) = settings.g, _inputs(sample, settings, sample.readings(0))
     K, D, cofactor, leverage = _solved(N, f, w, g, sample.readings(0))
     free = len(f) - 4
-    error, s, axes = _noise(K, N - f @ K.T - D, w, free)
+    s, axes = _noise(K, left := N - f @ K.T - D, w, free)
     low = to_gauge(K, "lower")
     covariance, nine = _two_of_nine(K, low, cofactor, axes)
     dop = np.sqrt(np.diagonal(cofactor))  # of K_a's columns as m/s^2 at 1 g, and of the bias
@@ -95,7 +95,7 @@ def fit_known(sample: Sample, settings: Settings) -> Fit:
         rms_before=np.sqrt([np.mean(raw**2)]),
         before=before,
         nominal=nominal,
-        residuals=_residuals(error, w, leverage, s, 3 * free, modulus, raw, force),
+        residuals=_residuals(left / axes, w, leverage, s, free, modulus, raw, force),
         notes=_notes(sample),
     )
 
@@ -155,15 +155,15 @@ def _check_axes(readings: Readings, N: Float, K: Float) -> None:
         )
 
 
-def _noise(K: Float, left: Float, w: Float, free: int) -> tuple[Float, float, Float]:
-    """Return what is left as force, m/s^2, shape (J, 3), its standard deviation s, and s_i in output units, shape (3,).
+def _noise(K: Float, left: Float, w: Float, free: int) -> tuple[float, Float]:
+    """Return the standard deviation s of what is left as force, m/s^2, and s_i in output units, shape (3,).
 
     Args:
         K: shape (3, 3); left: N - K_a f - D_a, output units, shape (J, 3); w: weights, shape (J,); free: J - 4.
     """
     error, room = np.linalg.solve(K, left.T).T, free if free > 0 else np.nan
     s = float(np.sqrt(np.sum(w[:, None] * error**2) / (3 * room)))
-    return error, s, np.sqrt(np.sum(w[:, None] * left**2, axis=0) / room)
+    return s, np.sqrt(np.sum(w[:, None] * left**2, axis=0) / room)
 
 
 def _attitudes(f: Float, sample: Sample) -> Int:
@@ -230,16 +230,21 @@ def covariance_of_twelve(result: Calibration) -> Float:
 def _residuals(
     error: Float, w: Float, leverage: Float, s: float, freedom: int, modulus: Float, raw: Float, force: Float
 ) -> PoseResiduals:
-    """Return the kept residuals, those of the modulus; outliers by all three axes (F test, Bonferroni)."""
-    room = room_of(leverage)
-    square = w * np.einsum("ji,ji->j", error, error) / room
-    outlier = np.zeros(len(w), dtype=bool)
-    if freedom > 3:
-        from scipy.special import fdtrc
+    """Return the kept residuals, those of the modulus; outliers by all three axes, each of its own noise (Bonferroni).
 
-        others = (s**2 * freedom - square) / (freedom - 3)
-        chance = fdtrc(3, freedom - 3, square / 3.0 / np.where(others > 0, others, np.nan)) * len(w)
-        outlier = chance < OUTLIER_LEVEL
+    The p-values of the axes become normal scores, whose squares add up to chi-square of three degrees of freedom.
+    `error` is what is left in units of the s_i, shape (J, 3), of so many degrees of freedom per axis.
+    """
+    room = room_of(leverage)
+    each = w[:, None] * error**2 / room[:, None]
+    square = each.sum(axis=1)
+    outlier = np.zeros(len(w), dtype=bool)
+    if freedom > 1:
+        from scipy.special import chdtrc, chdtri, fdtrc
+
+        others = (freedom - each) / (freedom - 1)
+        chance = fdtrc(1, freedom - 1, each / np.where(others > 0, others, np.nan))
+        outlier = len(w) * chdtrc(3, chdtri(1, chance).sum(axis=1)) < OUTLIER_LEVEL
     with np.errstate(divide="ignore", invalid="ignore"):
         studentised = np.sqrt(w) * modulus / (s * np.sqrt(room))
     kept = np.arange(len(w))

@@ -289,6 +289,12 @@ JUMP = 5.0
 MOST_CLUSTERS, FEWEST_CLUSTERS = 2048, 16
 """Clusters that are held, and the fewest that adjacent ones are merged into."""
 
+FEWEST_IN_TIME = 8
+"""The fewest that those of poses in time are merged into."""
+
+BARTLETT = 0.5
+"""Weight of the covariance of neighbours."""
+
 FEWEST_JUMPS = 8
 """Jumps of the attitude from which on what is between them is a pose, and rows of one pose are not independent."""
 
@@ -339,7 +345,7 @@ class NoiseSpread:
         )
 
 
-def plain_spread(variance: Float, cofactor: Float, freedom: Int) -> NoiseSpread:
+def plain_spread(variance: Float, cofactor: Float, freedom: Float | Int) -> NoiseSpread:
     """Return the spread of poses with the same noise: s^2, shape (R,), and (A^T W A)^-1, shape (R, q, q)."""
     nothing = np.full(len(variance), np.nan)
     covariance = variance[:, None, None] * cofactor
@@ -455,13 +461,13 @@ class Clusters:
 
     Attributes:
         length: rows of a cluster at most.
-        information: A^T W A of each, shape (C, 9, 9); score: A^T W e of each, and ones: A^T W 1, shape (C, 9).
+        information: A^T W A of each, shape (C, q, q); score: A^T W e of each, and ones: A^T W 1, shape (C, q).
     """
 
     length: int
-    information: Float = field(default_factory=lambda: np.zeros((0, 9, 9)))
-    score: Float = field(default_factory=lambda: np.zeros((0, 9)))
-    ones: Float = field(default_factory=lambda: np.zeros((0, 9)))
+    information: Float = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    score: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    ones: Float = field(default_factory=lambda: np.zeros((0, 0)))
     _last: Float | None = None
     _open: int = 0
 
@@ -470,19 +476,19 @@ class Clusters:
         """Return clusters for so many rows: the attitudes where they jump often enough, else blocks of time."""
         return cls(rows if jumps >= FEWEST_JUMPS else -(-2 * rows // MOST_CLUSTERS))
 
-    def add(self, u: Float, scaled: Float, w: Float) -> None:
-        """Add rows: unit directions, shape (B, 3), sqrt(w) e and w, shape (B,)."""
+    def add(self, u: Float, design: Float, scaled: Float, w: Float) -> None:
+        """Add rows: unit directions, shape (B, 3), A, shape (B, q), sqrt(w) e and w, shape (B,)."""
         jump = jumps(u, self._last)
         since = np.arange(len(u)) + self._open
         start = np.maximum.accumulate(np.where(jump, since, 0))
         begins = jump | ((since - start) % self.length == 0)
         begins[0] |= self._last is None
-        rows = design(u) * np.sqrt(w)[:, None]
+        rows, q = design * np.sqrt(w)[:, None], design.shape[1]
         at = np.flatnonzero(begins)
         head = at[0] if len(at) else len(u)
         cuts = np.concatenate([[0] if head else [], at]).astype(np.intp)
-        outer = np.add.reduceat((rows[:, :, None] * rows[:, None, :]).reshape(len(u), 81), cuts, axis=0)
-        information = outer.reshape(-1, 9, 9)
+        outer = np.add.reduceat((rows[:, :, None] * rows[:, None, :]).reshape(len(u), q * q), cuts, axis=0)
+        information = outer.reshape(-1, q, q)
         score = np.add.reduceat(rows * scaled[:, None], cuts, axis=0)
         ones = np.add.reduceat(rows * np.sqrt(w)[:, None], cuts, axis=0)
         if head and len(self.score):
@@ -490,8 +496,11 @@ class Clusters:
             self.score[-1] += score[0]
             self.ones[-1] += ones[0]
             information, score, ones = information[1:], score[1:], ones[1:]
-        self.information = np.concatenate([self.information, information])
-        self.score, self.ones = np.concatenate([self.score, score]), np.concatenate([self.ones, ones])
+        if self._last is None:
+            self.information, self.score, self.ones = information, score, ones
+        else:
+            self.information = np.concatenate([self.information, information])
+            self.score, self.ones = np.concatenate([self.score, score]), np.concatenate([self.ones, ones])
         self._last, self._open = u[-1], int(since[-1] - start[-1]) + 1 if len(at) else self._open + len(u)
         while len(self.score) > MOST_CLUSTERS:
             self._merge()
@@ -502,17 +511,21 @@ class Clusters:
         self.information = np.add.reduceat(self.information, pairs, axis=0)
         self.score, self.ones = (np.add.reduceat(part, pairs, axis=0) for part in (self.score, self.ones))
 
-    def spread(self, cofactor: Float) -> tuple[Float, float, int]:
-        """Return the covariance of the parameters, shape (9, 9), its degrees of freedom, and the number of clusters.
+    def spread(self, cofactor: Float, *, in_time: bool) -> tuple[Float, float, int]:
+        """Return the covariance of the parameters, shape (q, q), its degrees of freedom, and the number of clusters.
 
-        Neighbours are merged until their sums no longer follow each other.
+        Neighbours are merged until their sums no longer follow each other; poses `in_time`, whose drift shows in three
+        of the parameters alone, until there are few: a drift over many poses is within a cluster then.
 
         Args:
-            cofactor: (A^T W A)^-1, shape (9, 9).
+            cofactor: (A^T W A)^-1, shape (q, q).
         """
-        while len(self.score) >= 2 * FEWEST_CLUSTERS and self._correlated(cofactor):
+        many, fewest = 2 * FEWEST_CLUSTERS, FEWEST_IN_TIME if in_time else FEWEST_CLUSTERS
+        while in_time and len(self.score) >= many:
             self._merge()
-        return *_cr2(self, cofactor), len(self.score)
+        while len(self.score) >= 2 * fewest and self._correlated(cofactor):
+            self._merge()
+        return *_cr2(self, cofactor, in_time=in_time), len(self.score)
 
     def _correlated(self, cofactor: Float) -> bool:
         """Whether the contributions of neighbours to the estimates go together beyond chance."""
@@ -522,12 +535,13 @@ class Clusters:
         return bool(lag * np.sqrt(len(z)) > 1.0)
 
 
-def _cr2(clusters: Clusters, cofactor: Float) -> tuple[Float, float]:
+def _cr2(clusters: Clusters, cofactor: Float, *, in_time: bool) -> tuple[Float, float]:
     """Return the bias-reduced sandwich of clusters and its degrees of freedom [bell2002].
 
     With H_c the part of the hat matrix of cluster c, A_c^T (I - H_c)^-1/2 e_c = (I - G_c C)^-1/2 A_c^T e_c: everything
     happens in the space of the parameters. The degrees of freedom are those under an error that the rows of a cluster
-    share, the mean over the parameters.
+    share, the mean over the parameters. What clusters of poses `in_time` still share with their neighbours is added
+    with the weight of Bartlett [newey1987].
     """
     free = np.flatnonzero(np.diagonal(cofactor) > 0)
     root = np.linalg.cholesky(cofactor[np.ix_(free, free)])
@@ -537,7 +551,11 @@ def _cr2(clusters: Clusters, cofactor: Float) -> tuple[Float, float]:
     inverse = (vectors / np.sqrt(np.maximum(1.0 - values, 1e-3))[:, None, :]) @ vectors.swapaxes(1, 2)
     z = (inverse @ (clusters.score[:, free] @ root)[..., None])[..., 0]
     covariance = np.zeros_like(cofactor)
-    covariance[np.ix_(free, free)] = root @ (z.T @ z) @ root.T
+    inner = z.T @ z
+    if in_time:
+        lagged = BARTLETT * (z[1:].T @ z[:-1])
+        inner = inner + lagged + lagged.T
+    covariance[np.ix_(free, free)] = root @ inner @ root.T
     ones, freedoms = clusters.ones[:, free] @ root, []
     for row in root:
         v = inverse @ row  # (C, p)

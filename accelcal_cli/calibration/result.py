@@ -108,6 +108,28 @@ class Temperature:
 
 
 @frozen(eq=False)
+class Worn:
+    """What GGIR says of a calibration with days of wear [vanhees2014], beside what the rest of a result says.
+
+    Attributes:
+        hours: of the recording; rest_hours: at rest; windows: at rest, of 10 s, the points of GGIR.
+        low, high: least and greatest specific force of each axis at rest, parts of g, shape (3,).
+        filled: whether each axis was beyond 0.3 g on both sides: without, GGIR does not calibrate.
+        error_before, error_after: mean of | |a| - 1 g | over the windows, mg; before: of the readings as they are, NaN
+            where their unit is not known.
+    """
+
+    hours: float
+    rest_hours: float
+    windows: Count
+    low: Vector
+    high: Vector
+    filled: bool
+    error_before: MaybeNan
+    error_after: MaybeNan
+
+
+@frozen(eq=False)
 class Sigma:
     """One-sigma of the parameters, or the half-widths of their intervals; NaN where the poses do not determine them.
 
@@ -213,6 +235,7 @@ class Calibration:
         notes: sentences about the data and the search that a user should know.
         version: of accelcal; schema: SCHEMA.
         temperature: slopes with temperature, when the readings determine them.
+        worn: of days of wear, what GGIR says; else None.
     """
 
     K_a: Annotated[Float, array(3, 3, largest=LARGEST)]
@@ -259,6 +282,7 @@ class Calibration:
     temperature: Temperature | None = None
     coverage_factor: float | None = None
     shared_noise: float | None = None
+    worn: Worn | None = None
 
     @property
     def sigma_freedom(self) -> float:

@@ -34,6 +34,10 @@ NEEDS = {
 HUBER = 1.345
 """Huber's k: 95 % of the efficiency of least squares under normal noise (Huber 1964)."""
 
+NOISE_TOLD: dict[Robust, float] = {"huber": 0.74, "soft-l1": 0.65}
+"""Degrees of freedom of s^2 under a robust loss, per one of the residuals: 2 / (J var log s^2) for normal residuals in
+units of their median. A loss that looks away from large residuals knows their size less well."""
+
 NO_NOISE = 1e-9
 """Residuals, or their standard deviation, below this part of g are rounding: readings are seldom written with ten
 digits, and no accelerometer is as quiet."""
@@ -80,6 +84,7 @@ class Sample:
         blocks: the outputs, shape (R, B, 3) a block, output units.
         doubtful: whether `readings` has warnings, or might have, shape (R,).
         labelled: whether a label makes each pose an attitude of its own, shape (R,).
+        in_time: whether poses follow each other in time, so that neighbours may share errors, shape (R,).
         readings: of each sensor by its number, from 0: origin, names of the poses, notes and warnings of the reader.
         count: raw readings behind each pose, shape (R, J); scatter: standard deviation of one of them, shape
             (R, J, 3), output units; cross: covariances xy, xz, yz of one, shape (R, J, 3), output units squared; NaN
@@ -93,6 +98,7 @@ class Sample:
     blocks: Blocks
     doubtful: Bool
     labelled: Bool
+    in_time: Bool
     readings: Callable[[int], Readings]
     count: Float | None = None
     scatter: Float | None = None
@@ -128,6 +134,7 @@ class Sample:
                 ]
             ),
             labelled=np.array([one.labels is not None for one in readings]),
+            in_time=np.array([one.in_time for one in readings]),
             readings=readings.__getitem__,
             count=stack("count"),
             scatter=stack("scatter"),
@@ -149,6 +156,7 @@ class Sample:
             blocks=lambda: iter([(0, batch.output)]),
             doubtful=doubtful,
             labelled=fleet.labelled(batch),
+            in_time=np.zeros_like(doubtful),
             readings=lambda at: fleet.one(batch, at),
             count=batch.behind,
             scatter=batch.scatter,
@@ -194,6 +202,7 @@ class Sample:
             blocks=lambda: ((first, block[index]) for first, block in self.blocks()),
             doubtful=self.doubtful[index],
             labelled=self.labelled[index],
+            in_time=self.in_time[index],
             readings=lambda at: self.readings(numbers[at]),
             **parts,
         )

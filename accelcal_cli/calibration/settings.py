@@ -9,7 +9,14 @@ from typing import Any, Literal
 
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.optimizer import Optimizer, State, built, shipped_parameters
+from accelcal_cli.optimization.optimizer import (
+    OPTIMIZERS,
+    Optimizer,
+    State,
+    built,
+    preset_parameters,
+    shipped_parameters,
+)
 from accelcal_cli.schema import Checked, check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, Gauge
 
@@ -107,27 +114,46 @@ class Settings:
         return built(self.optimizer, self.parameters)
 
 
+def _of_preset(name: Any, preset: Any, where: str) -> dict[str, Any]:
+    if preset is None or not isinstance(name, str):
+        return {}
+    try:
+        return preset_parameters(name, preset)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
 def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
     """Return the settings of a calibration: shipped defaults, then a file, then the command line.
 
     Args:
         path: the file of `--config`, or None.
-        overrides: what the command line states; `parameters` holds settings of the optimizer.
+        overrides: what the command line states; `parameters` holds settings of the optimizer. Here and in the file
+            `preset` names one of the optimizer's, beneath its parameters.
 
     Raises:
         ConfigError: the file cannot be read or says something that is not known.
     """
     where = str(path) if path else "command line"
     stated = load_mapping(path) if path else {}
-    stated.pop("source", None)  # documentation: the paper the numbers come from
+    for note in ("source", "presets"):  # of a shipped file of an optimizer: they set nothing
+        stated.pop(note, None)
     merged = {**stated, **overrides}
     name = merged.get("optimizer", Settings.optimizer)
+    if ":" in str(overrides.get("optimizer", "")):
+        OPTIMIZERS.imported(str(name))  # stated on the command line: the only place that may import code
+    elif ":" in str(name):
+        raise ConfigError(f"{where}: optimizer {name}: a file imports no code; state it by --optimizer")
     own = stated.get("parameters") or {}
     if not isinstance(own, Mapping):
         raise ConfigError(f"{where}: parameters: expected a mapping of keys, not {own!r}")
     if stated.get("optimizer", name) != name:
-        own = {}  # the file's parameters belong to the optimizer that the command line replaced
-    parameters = {**shipped_parameters(name), **own, **overrides.get("parameters", {})}
+        own = {}  # the file's parameters and preset belong to the optimizer that the command line replaced
+        stated.pop("preset", None)
+    preset = overrides.get("preset", stated.get("preset"))
+    merged.pop("preset", None)
+    shipped = {**shipped_parameters(name), **_of_preset(name, preset, where)}
+    parameters = {**shipped, **own, **overrides.get("parameters", {})}
     settings = from_mapping(Settings, {**merged, "parameters": parameters}, where)
     settings.build_optimizer()
     return settings

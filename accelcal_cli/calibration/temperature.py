@@ -33,6 +33,12 @@ from accelcal_cli.sensor.model import ErrorModel, to_gauge
 SMALLEST_RANGE = 5.0
 """Degrees between the coldest and the warmest pose below which slopes would be extrapolated at once."""
 
+RANGE_IN_TIME = 2.5
+"""The same for poses in time, whose temperature goes up and down every day: hundreds of them tell slopes in less."""
+
+FEWEST_FOR_SLOPES = 17
+"""Poses, two more than parameters."""
+
 MOST_POSES = 100_000
 ROBUST_ROUNDS, ROBUST_SETTLED = 10, 0.1
 """Rounds at most in which slopes and robust weights follow each other, and the part of a sigma that ends them."""
@@ -87,7 +93,8 @@ def _settled(solution: Solution, degrees: Float) -> tuple[Solution, tuple[Slopes
     stated, before = replace(stated.with_weights(weights), own=None), -1.0
     for _ in range(SHARED_ROUNDS):
         solution = replace(solution, stated=stated)
-        fitted = _fit(solution, degrees)
+        # Means of many readings may outweigh all others until the error that they share is known.
+        fitted = _fit(solution, degrees) or (fitted if before < 0 else None)
         if fitted is None:
             return solution, None
         stated, shared = share(stated, fitted[1], fitted[0].sensor, 9 + SLOPES)
@@ -236,10 +243,11 @@ def _unsuitable(solution: Solution, degrees: Float) -> str:
         return f"more than {MOST_POSES:,} poses"
     if not np.isfinite(degrees).all():
         return f"it is missing in {int((~np.isfinite(degrees)).sum())} poses"
-    if np.ptp(degrees) < SMALLEST_RANGE:
-        return f"the poses differ by {np.ptp(degrees):.2g} degrees, and {SMALLEST_RANGE:g} are needed"
-    if poses < 17:
-        return f"{poses} poses are too few for fifteen parameters; take at least 17"
+    least = RANGE_IN_TIME if solution.stated.sample.in_time[0] else SMALLEST_RANGE
+    if np.ptp(degrees) < least:
+        return f"the poses differ by {np.ptp(degrees):.2g} degrees, and {least:g} are needed"
+    if poses < FEWEST_FOR_SLOPES:
+        return f"{poses} poses are too few for fifteen parameters; take at least {FEWEST_FOR_SLOPES}"
     return ""
 
 

@@ -20,7 +20,9 @@ def command(
     result: options.ResultFile,
     data: Annotated[
         str,
-        typer.Argument(help="Raw log: CSV, text or Parquet; - is standard input.", rich_help_panel="Input"),
+        typer.Argument(
+            help="Raw log: text, Parquet, Arrow or native; - is standard input.", rich_help_panel="Input"
+        ),
     ],
     columns: options.Columns = None,
     form: options.TextOptions,
@@ -75,7 +77,8 @@ def command(
         parquet = Path(output).suffix.lower() in PARQUET
         with whole_file(output, binary=True) as file:
             log.write(file, parquet=parquet)
-        skipped = table.notes if parquet or table.rows_skipped else ()
+        rewritten = parquet or table.rows_skipped or table.source_format != "csv"
+        skipped = table.notes if rewritten else ()
     finally:
         table.close()
     sys.stdout.flush()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from accelcal_cli.cli import options, process
+from accelcal_cli.cli import options, process, wear
 from accelcal_cli.errors import UsageError
 from accelcal_cli.schema import frozen
 
@@ -23,6 +23,7 @@ SUFFIXES = (".yaml", ".yml", ".json")
 
 ROBUST = ("none", "huber", "soft-l1")
 ATTITUDES = ("unknown", "known")
+PRESETS = ("printed", "tuned")
 
 in_model, in_search = options.panel("Model"), options.panel("Search")
 
@@ -86,6 +87,14 @@ class SearchOptions:
             autocompletion=options.one_of(options.optimizers),
         ),
     ] = None
+    preset: Annotated[
+        str | None,
+        in_search(
+            help="Settings of the optimizer beneath those that are stated: {choices}.",
+            show_default="its defaults",
+            autocompletion=options.one_of(PRESETS),
+        ),
+    ] = None
     population: Annotated[int | None, in_search(help="Points of the search.")] = None
     iterations: Annotated[int | None, in_search(help="Iterations of the search.")] = None
     runs: Annotated[int | None, in_search(help="Independent searches (multi-start).")] = None
@@ -100,7 +109,7 @@ def command(
     data: Annotated[
         str,
         typer.Argument(
-            help="CSV, text or Parquet file of static readings, or with --raw of a log; - is standard input.",
+            help="Static readings, or with --raw a log: text, Parquet, Arrow or native; - is standard input.",
             rich_help_panel="Input",
         ),
     ],
@@ -116,6 +125,7 @@ def command(
         bool,
         options.in_log("--raw", help="The file is a raw log: find its static poses first, as detect does."),
     ] = False,
+    worn: wear.Worn = False,
     log: options.DetectionOptions,
     tolerance: Annotated[
         float | None,
@@ -143,23 +153,27 @@ def command(
     _check_output(output, format)
     stated_g = gravity.stated()
     log.check_raw(raw)
+    if worn:
+        wear.check(raw, log)
     stated = options.stated(**vars(model), **vars(search), g=stated_g)
     stated["parameters"] = {name: stated.pop(name) for name in ("population", "iterations") if name in stated}
     settings = _settings(config, stated, raw)
-    if raw:
-        readings = log.poses(
-            data,
-            columns,
-            lambda unit: local_g(settings, gravity, config, unit),
-            form,
-            misalignment=settings.misalignment,
-        )
+    rest = None
+    own_g = partial(local_g, settings, gravity, config)
+    if worn:
+        parts = {"misalignment": settings.misalignment, "slopes": settings.temperature}
+        rest = wear.find(data, columns, log, own_g, form, **parts)
+        readings = rest.readings()
+    elif raw:
+        readings = log.poses(data, columns, own_g, form, misalignment=settings.misalignment)
     else:
         readings = read_readings(
             data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
         )
-    settings = replace(settings, g=local_g(settings, gravity, config, readings.form.unit))
+    settings = replace(settings, g=own_g(readings.form.unit))
     result = calibrate(readings, settings)
+    if rest is not None:
+        result = replace(result, worn=rest.figures(result))
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():
         _show(result, format, output)

@@ -16,6 +16,7 @@ from accelcal_cli.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.scenarios import Recording, Simulation
+    from accelcal_cli.views.blocks import Table
 
 UNKNOWNS = {"lower": 9, "full": 12}
 DEFAULT = ("pso", "de", "de-pso", "levenberg-marquardt", "ellipsoid")
@@ -109,6 +110,17 @@ def command(
             autocompletion=options.several_of(options.optimizers_or_all),
         ),
     ] = None,
+    preset: running.Preset = None,
+    peer: running.Peers = None,
+    evaluations: Annotated[
+        int | None,
+        in_search(
+            help="Evaluations per run; the generation under way is finished.",
+            show_default="none; 50,000 with --peer",
+            min=1,
+            max=1_000_000_000,
+        ),
+    ] = None,
     config: Annotated[Path | None, in_search(help="YAML file: optimizers and their parameters.")] = None,
     population: Annotated[
         int | None, in_search(help="Points of the search.", show_default="each optimizer's own", min=1)
@@ -163,7 +175,9 @@ def command(
             "(errors are always those of gauge lower)"
         )
     space = SearchSpace(options.GravityOptions(g).stated() or STANDARD_GRAVITY, UNKNOWNS[gauge])
-    entries = choose(words(optimizer or ()), config, DEFAULT, Budget(population, iterations))
+    peers, evaluations = running.peer_entries(peer), running.peer_budget(peer, evaluations)
+    budget = Budget(population, iterations, evaluations)
+    entries = choose(words(optimizer or ()), config, DEFAULT, budget, preset) + peers
     source: Simulation | Recording
     if data is not None:
         source = _recorded(data, columns, form, space.g, simulation)
@@ -171,7 +185,9 @@ def command(
         raise UsageError(f"--{next(iter(needless)).replace('_', '-')} needs a file of readings")
     else:
         source = simulation.scenario()
-    study = Comparison(source, space, tuple(entries), runs, seed, tolerance, polish=polish)
+    study = Comparison(
+        source, space, tuple(entries), runs, seed, tolerance, polish=polish, evaluations=evaluations
+    )
     records = study_options.run(study)
     title, conditions = experiments.comparison_subject(study), experiments.comparison_conditions(study)
     rows, curves = experiments.comparison_table(study, records), median_curves(study, records)[""]
@@ -179,10 +195,18 @@ def command(
     options.print_result(
         format,
         rows,
-        lambda: study_blocks(title, [replace(rows.filled(), title="")], shown, conditions),
+        lambda: study_blocks(title, _shown(rows), shown, conditions),
     )
     running.draw_convergence(plot, title, {conditions: curves}, 0.0 if study.noisy else study.tolerance)
     options.tell_written([study_options.raw, plot], study_options.quiet)
+
+
+def _shown(rows: Table) -> list[Table]:
+    """Return what people see of a comparison: its table without empty columns, and the spread of the costs."""
+    from accelcal_cli.views.experiments import split_spread
+
+    rest, costs = split_spread(rows)
+    return [replace(rest.filled(), title=""), costs]
 
 
 def _recorded(

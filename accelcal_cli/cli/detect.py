@@ -20,7 +20,7 @@ def command(
     data: Annotated[
         str,
         typer.Argument(
-            help="CSV, text or Parquet file of a raw log; - is standard input.", rich_help_panel="Input"
+            help="Raw log: text, Parquet, Arrow or native; - is standard input.", rich_help_panel="Input"
         ),
     ],
     columns: options.Columns = None,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from accelcal_cli.cli import options, process
+from accelcal_cli.cli import options, process, wear
 from accelcal_cli.errors import AccelcalError, ConfigError, UsageError
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
     from accelcal_cli.detection.detect import Detection
+    from accelcal_cli.detection.worn import Wear
     from accelcal_cli.io.readings import Readings
 
 SUFFIXES = (".csv", ".parquet", ".json")
@@ -41,7 +42,7 @@ def command(
         list[str],
         typer.Argument(
             help="Table of static readings with a column that labels the sensor, or one file per sensor; with --raw "
-            "logs; CSV, text or Parquet; - is standard input.",
+            "logs; text, Parquet, Arrow or native; - is standard input.",
             rich_help_panel="Input",
         ),
     ],
@@ -79,6 +80,7 @@ def command(
             "--raw", help="The files are raw logs: find the static poses of each first, as detect does."
         ),
     ] = False,
+    worn: wear.Worn = False,
     log: options.DetectionOptions,
     tolerance: Annotated[
         float | None,
@@ -116,6 +118,8 @@ def command(
     options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
     log.check_raw(raw)
+    if worn:
+        wear.check(raw, log)
     stated_g = gravity.stated()
     stated = options.stated(g=stated_g, gauge=gauge, weights=weights)
     filed = {} if config is None else load_mapping(config)
@@ -137,7 +141,7 @@ def command(
     labels: Sequence[str]
     run: Callable[[Settings, Callable[[int, Calibration], None] | None], Fleet]
     if raw:
-        logs = _Logs(columns, form, log, local_g)
+        logs = _Logs(columns, form, log, local_g, worn, settings.temperature)
         logs.read(data, sensor_column)
         labels, notes, run = logs.labels, logs.told(), partial(calibrate_each, logs.readings)
         g = logs.g or settings.g
@@ -175,6 +179,7 @@ class _Logs:
 
     Attributes:
         columns, form, log, local_g: see `options.DetectionOptions.detect`.
+        worn: they are of days of wear; slopes: with temperature are fitted.
         labels: of the sensors; readings: the static poses of each, or why there are none.
         gravities: local gravity in the unit of each that has poses, by its number; g: in that of most of them.
         notes: what there is to say of logs, and of how many.
@@ -184,6 +189,8 @@ class _Logs:
     form: options.TextOptions
     log: options.DetectionOptions
     local_g: Callable[[str | None], float]
+    worn: bool = False
+    slopes: bool = True
     labels: list[str] = field(default_factory=list)
     readings: list[Readings | str] = field(default_factory=list)
     gravities: dict[int, float] = field(default_factory=dict)
@@ -209,13 +216,21 @@ class _Logs:
                 continue
             for label, form in parts:
                 try:
-                    self._add(label, source, self.log.detect(source, self.columns, self.local_g, form))
+                    self._add(label, source, self._found(source, form))
                 except AccelcalError as error:
                     self._add(label, source, error)
                     faults.append(error)
         if len(faults) == len(self.labels) and all(isinstance(error, UsageError) for error in faults):
             raise faults[0]
         self._leave_out_other_units()
+
+    def _found(self, source: str, form: options.TextOptions) -> Detection | Wear:
+        """Find the static poses of a log."""
+        if not self.worn:
+            return self.log.detect(source, self.columns, self.local_g, form)
+        return wear.find(
+            source, self.columns, self.log, self.local_g, form, misalignment=True, slopes=self.slopes
+        )
 
     def told(self) -> list[str]:
         """Return the notes, each once with the number of its logs where there are several."""
@@ -248,7 +263,7 @@ class _Logs:
             for label, condition in found
         ]
 
-    def _add(self, label: str, source: str, found: Detection | AccelcalError) -> None:
+    def _add(self, label: str, source: str, found: Detection | Wear | AccelcalError) -> None:
         """Add a sensor: its poses, or why there are none."""
         self.labels.append(label)
         if isinstance(found, AccelcalError):

@@ -28,6 +28,8 @@ def command(
     from accelcal_cli.output.machine import json_rows
     from accelcal_cli.views import studies as views
 
+    if name and ":" in name:
+        OPTIMIZERS.imported(name)
     table = views.optimizer_settings(name) if name else views.optimizer_catalogue()
     blocks = views.optimizer_settings_blocks if name else views.optimizer_catalogue_blocks
     options.print_result(

@@ -253,14 +253,21 @@ class TextOptions:
             metavar="COLUMN",
         ),
     ] = None
+    accelerometer: Annotated[
+        str | None,
+        in_input(
+            help="The accelerometer of a log that has several, as sensor_accel[1], IMU[0] or /imu.",
+            show_default="the only one",
+            metavar="NAME",
+        ),
+    ] = None
 
     def read_options(self) -> ReadOptions:
         """Return the options as the library takes them."""
         from accelcal_cli.io.reader import ReadOptions
 
-        return ReadOptions(
-            self.skip_rows or 0, bool(self.skip_bad), self.line, self.count, tuple(self.where or ())
-        )
+        skipped, where = self.skip_rows or 0, tuple(self.where or ())
+        return ReadOptions(skipped, bool(self.skip_bad), self.line, self.count, where, self.accelerometer)
 
 
 LARGEST_MULTIPLIER = 1e6

@@ -6,7 +6,7 @@ The progress bar, the journal of finished runs beside the raw file, and the mess
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +18,7 @@ from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
 
 if TYPE_CHECKING:
     from accelcal_cli.studies.engine import Executors, Journal, Progress
-    from accelcal_cli.studies.study import Curves, Record, Study
+    from accelcal_cli.studies.study import Curves, Entry, Record, Study
 
 MOST_JOBS = 1024
 RAW_SUFFIXES = (".csv", ".parquet")
@@ -30,6 +30,51 @@ Plot = Annotated[
     str | None,
     options.in_output("--plot", help="Draw convergence to a .png or .svg file.", metavar="FILE"),
 ]
+PRESETS = ("printed", "tuned")
+"""Names of optimization.optimizer, stated again so that help need not import it; a test compares them."""
+
+Preset = Annotated[
+    str | None,
+    options.panel("Search")(
+        "--preset",
+        help="Settings of the optimizers beneath those that are stated: {choices}.",
+        show_default="each optimizer's defaults",
+        autocompletion=options.one_of(PRESETS),
+    ),
+]
+
+
+Peers = Annotated[
+    list[str] | None,
+    options.panel("Search")(
+        "--peer",
+        help="Optimizers of other libraries beside ours, LIBRARY:NAME as scipy:differential_evolution, pygmo:pso_gen; "
+        "all get the same evaluations.",
+        metavar="NAMES",
+    ),
+]
+
+
+def peer_entries(stated: list[str] | None) -> list[Entry]:
+    """Return the entries of the peers that are named, after a look whether there are such."""
+    if not stated:
+        return []
+    from accelcal_cli.studies.peers import peer
+    from accelcal_cli.studies.study import Entry, words
+
+    names = words(stated)
+    for name in names:
+        peer(name)
+    return [Entry(name, name, peer=True) for name in names]
+
+
+def peer_budget(stated: list[str] | None, evaluations: int | None) -> int | None:
+    """Return the evaluations of all optimizers: those that are stated, or with peers the usual 50,000."""
+    if evaluations is None and stated:
+        from accelcal_cli.studies.peers import BUDGET
+
+        return BUDGET
+    return evaluations
 
 
 @dataclass(frozen=True)
@@ -94,12 +139,18 @@ class StudyOptions:
         return partial(pools.local_pool, useful) if useful > 1 else None
 
 
-def draw_convergence(plot: str | None, title: str, curves: Curves, tolerance: float) -> None:
+def draw_convergence(
+    plot: str | None,
+    title: str,
+    curves: Curves,
+    tolerance: float,
+    bands: Callable[[], tuple[Curves, Curves]] | None = None,
+) -> None:
     """Write the picture of the median convergence where one was asked for; see `output.plot.plot_convergence`."""
     if plot is not None:
         from accelcal_cli.output.plot import plot_convergence
 
-        plot_convergence(title, curves, tolerance, plot)
+        plot_convergence(title, curves, tolerance, plot, bands() if bands else None)
 
 
 def _kept(journal: Journal) -> str:

@@ -172,8 +172,8 @@ class RawLog:
     @property
     def form(self) -> InputForm:
         """How the log is written; its rows are those of the detection."""
-        table = self._table
-        return InputForm(table.source_format, 0, table.rows_skipped, self.clock.rate, self.columns.unit)
+        table, unit = self._table, self.columns.unit
+        return InputForm(table.source_format, 0, table.rows_skipped, self.clock.rate, unit, table.correction)
 
     @property
     def sha256(self) -> str:
@@ -232,9 +232,9 @@ class RawLog:
         self._table.close()
 
     def _check_time(self, time: Float, last: float, start: int) -> None:
-        back = np.diff(time, prepend=last) < 0
-        if back.any():
-            row = int(np.argmax(back))
+        back = time[1:] < time[:-1]
+        if time[0] < last or back.any():
+            row = 0 if time[0] < last else int(np.argmax(back)) + 1
             before = time[row - 1] if row else last
             single = (
                 row

@@ -305,9 +305,13 @@ def read_tiles(log: RawLog, lengths: RowLengths, envelope: Envelope | None = Non
 
 def _known_mean(rows: Float) -> Float:
     """Return the mean of each row without its NaN, shape (B,); NaN where there is nothing else."""
-    known = np.isfinite(rows)
-    total, count = np.where(known, rows, 0.0).sum(axis=1), known.sum(axis=1)
-    return np.asarray(np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0))
+    mean: Float = np.add.reduce(rows, axis=1) / rows.shape[1]
+    gappy = np.isnan(mean)
+    if gappy.any():
+        known = np.isfinite(rows[gappy])
+        total, count = np.where(known, rows[gappy], 0.0).sum(axis=1), known.sum(axis=1)
+        mean[gappy] = np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)
+    return mean
 
 
 @dataclass(frozen=True)

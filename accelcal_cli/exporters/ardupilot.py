@@ -40,36 +40,42 @@ class ArduPilot(DiagonalExporter):
 
     suffix = ".param"
 
-    instance: int = setting(0, INSTANCE, low=0, high=2)
+    instance: int | None = setting(None, INSTANCE, low=0, high=2)
 
     def content(self, result: Calibration) -> bytes:
         """Return the parameters, one per line."""
         from accelcal_cli.sensor.poses import AXES
 
         offset, triad = self.triad(result)
-        slopes, number = self.bias_slopes(result), "" if self.instance == 0 else str(self.instance + 1)
+        slopes, instance, correction = self.bias_slopes(result), self.number(result), self.correction(result)
+        number = "" if instance == 0 else str(instance + 1)
         header = [
             *self.header(result),
             "ArduPilot: corrected = (reading - ACCOFFS) * ACCSCAL, m/s^2, in the axes of the log.",
             *self.notes(result),
         ]
-        values: dict[str, float] = {}
+        device = None if correction is None else correction.device_id
+        values: dict[str, float] = {} if device is None else {f"INS_ACC{number}_ID": device}
         for key, numbers in (("OFFS", offset), ("SCAL", triad.scale)):
             values |= {
                 f"INS_ACC{number}{key}_{axis.upper()}": float(v)
                 for axis, v in zip(AXES, numbers, strict=True)
             }
         if slopes is not None and result.temperature is not None:
-            header += self._thermal_notes()
-            values |= self._thermal(slopes, result.temperature)
-        lines = "".join(f"{key},{value:.9g}\n" for key, value in values.items())
+            header += self._thermal_notes(instance + 1)
+            values |= self._thermal(instance + 1, slopes, result.temperature)
+        lines = "".join(
+            f"{key},{value}\n" if isinstance(value, int) else f"{key},{value:.9g}\n"
+            for key, value in values.items()
+        )
         return (base.comment(header) + lines).encode()
 
-    def _thermal(self, slopes: Float, drift: Temperature) -> dict[str, float]:
+    @staticmethod
+    def _thermal(number: int, slopes: Float, drift: Temperature) -> dict[str, float]:
         """Return the parameters of the temperature calibration, whose polynomials are linear."""
         from accelcal_cli.sensor.poses import AXES
 
-        name, nothing = f"INS_TCAL{self.instance + 1}", 0.0 * slopes
+        name, nothing = f"INS_TCAL{number}", 0.0 * slopes
         powers = enumerate((slopes * PER_COEFFICIENT, nothing, nothing), start=1)
         return {
             f"{name}_ENABLE": 1,
@@ -80,11 +86,12 @@ class ArduPilot(DiagonalExporter):
                 for p, row in powers
                 for axis, v in zip(AXES, row, strict=True)
             },
-            f"INS_ACC{self.instance + 1}_CALTEMP": drift.reference,
+            f"INS_ACC{number}_CALTEMP": drift.reference,
         }
 
-    def _thermal_notes(self) -> list[str]:
-        name = f"INS_TCAL{self.instance + 1}"
+    @staticmethod
+    def _thermal_notes(number: int) -> list[str]:
+        name = f"INS_TCAL{number}"
         return [
             "ArduPilot subtracts 1e-6 ACC1 (T - CALTEMP) before ACCOFFS, T in degrees Celsius, held within "
             f"{name}_TMIN and TMAX.",

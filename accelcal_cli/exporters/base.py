@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # the help of `accelcal export` does not wait for numpy
     from accelcal_cli.calibration.result import Calibration, Temperature
     from accelcal_cli.sensor.model import ErrorModel
     from accelcal_cli.sensor.triad import Triad
+    from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 NEAR_ONE = (0.5, 2.0)
 """Scale factors of readings that are specific force already, in m/s^2 or in g."""
@@ -83,6 +84,15 @@ class Exporter(Checked, ABC):
         """Return which slopes the file of a result with slopes holds."""
         return self.slopes
 
+    def why_no_slopes(self, result: Calibration) -> str:  # noqa: ARG002  # of other formats
+        """Return why the file holds no slopes at all."""
+        if self.slopes == "none":
+            return "this format has no temperature slopes"
+        limits = f"{CELSIUS[0]:g} to {CELSIUS[1]:g}"
+        return (
+            f"temperature slopes are left out, because the temperatures are not degrees Celsius of {limits}"
+        )
+
     def _slopes_left_out(self, result: Calibration) -> tuple[str, ...]:
         drift, held = result.temperature, self.held(result)
         if drift is None or held == "all":
@@ -94,20 +104,15 @@ class Exporter(Checked, ABC):
                 "this format has temperature slopes of the bias only: those of the scale factors are left out, an "
                 f"error of up to {size}",
             )
-        why = (
-            "this format has no temperature slopes"
-            if self.slopes == "none"
-            else f"temperature slopes are left out, because the temperatures are not degrees Celsius of "
-            f"{CELSIUS[0]:g} to {CELSIUS[1]:g}"
-        )
-        return (f"{why}: the numbers hold at {drift.reference:.4g} degrees, with an error of up to {size}",)
+        held_at = f"the numbers hold at {drift.reference:.4g} degrees, with an error of up to {size}"
+        return (f"{self.why_no_slopes(result)}: {held_at}",)
 
 
 EXPORTERS: Registry[Exporter] = Registry(
     Exporter, "accelcal_cli.exporters", "export format", "accelcal.exporters"
 )
 
-INSTANCE = "number of the accelerometer in the target, from 0"
+INSTANCE = "number of the accelerometer in the target, from 0; without it that of the vehicle's log, else 0"
 
 
 def left_at_the_ends(result: Calibration, drift: Temperature, held: Slopes) -> float:
@@ -124,7 +129,7 @@ def left_at_the_ends(result: Calibration, drift: Temperature, held: Slopes) -> f
 class DriverExporter(Exporter):
     """Base of the formats of targets that correct what a driver makes of the sensor's output, in m/s^2."""
 
-    instance: int = setting(0, INSTANCE, low=0)
+    instance: int | None = setting(None, INSTANCE, low=0)
     driver_scale: float | None = setting(
         None, "output units that the target's driver takes for 1 m/s^2", above=0
     )
@@ -233,16 +238,58 @@ STRAIGHT = 1.0
 class DiagonalExporter(DriverExporter):
     """Base of the formats of targets that correct axis by axis, know no misalignments, and turn the board afterwards.
 
-    They get the sensor's own triad of axes, and the mounting of known attitudes apart from it.
+    They get the sensor's own triad of axes, and the mounting of known attitudes apart from it. Readings of a vehicle's
+    log were corrected by its parameters already, which the log tells: the new ones replace these.
     """
 
     orientation: ClassVar[str]
     """The target's parameter of the board orientation, one of ORIENTATIONS."""
     slopes = "bias"
 
+    def export(self, result: Calibration) -> Export:
+        """Return the result in this format, as one of the driver's readings."""
+        return super().export(self.of_driver(result))
+
+    def of_driver(self, result: Calibration) -> Calibration:
+        """Return the result as it is of the driver's readings, before a vehicle corrected them."""
+        from dataclasses import replace
+
+        import numpy as np
+
+        correction, drift = self.correction(result), result.temperature
+        if correction is None or correction.doubt:
+            return result
+        K, D = correction.of_driver(result.K_a, result.D_a)
+        if drift is not None:
+            scale = np.abs(np.array(correction.turn)).T @ drift.scale
+            drift = replace(drift, bias=correction.undone(drift.bias), scale=scale)
+        K_A = np.linalg.inv(K)
+        return replace(result, K_a=K, D_a=D, K_A=K_A, f_0=K_A @ D, temperature=drift)
+
+    def correction(self, result: Calibration) -> VehicleCorrection | None:
+        """Return what a vehicle of this system had done to the readings, None where they are of no such log."""
+        from accelcal_cli.sensor.vehicle import VehicleCorrection
+
+        correction = VehicleCorrection.from_record(result.data.get("correction"))
+        return correction if correction is not None and correction.system == self.name else None
+
+    def number(self, result: Calibration) -> int:
+        """Return the number of the accelerometer: as stated, or that of the log, or 0."""
+        correction = self.correction(result)
+        return self.instance if self.instance is not None else correction.instance if correction else 0
+
+    def why_no_slopes(self, result: Calibration) -> str:
+        """Return that the target has slopes of its own, or that temperatures are none."""
+        correction = self.correction(result)
+        if correction is not None and correction.thermal:
+            return "the vehicle compensated temperature before, and goes on with it, so temperature slopes are left out"
+        return super().why_no_slopes(result)
+
     def held(self, result: Calibration) -> Slopes:
         """Return that slopes of the bias are held where temperatures are degrees Celsius, as the target measures."""
-        drift = result.temperature
+        drift, correction = result.temperature, self.correction(result)
+        if correction is not None and correction.thermal:
+            return "none"
         return "bias" if drift and CELSIUS[0] <= drift.low and drift.high <= CELSIUS[1] else "none"
 
     def bias_slopes(self, result: Calibration) -> Float | None:
@@ -262,8 +309,9 @@ class DiagonalExporter(DriverExporter):
         from accelcal_cli.sensor.triad import Triad
 
         triad, metres = Triad.of(result.K_a), result.g * metres_per_unit(result)
-        mounting = self._mounting(result, triad)
+        mounting, correction = self._mounting(result, triad), self.correction(result)
         return [
+            *([] if correction is None else [f"{correction.in_words()}."]),
             "Scales: of the sensor's own axes, with the least rms error over all directions that a scale for each axis "
             f"can leave: {triad.rms * metres:.3g} m/s^2 at 1 g, at most {triad.worst * metres:.3g} m/s^2.",
             *(f"Mounting, not in the numbers: {text}." for text in mounting),
@@ -275,10 +323,12 @@ class DiagonalExporter(DriverExporter):
         from accelcal_cli.sensor.triad import Triad, angle
 
         triad = Triad.of(result.K_a)
+        correction = self.correction(result)
+        doubt = () if correction is None or not correction.doubt else (correction.in_words(),)
         turned = triad.mirrored or angle(triad.axes) > STRAIGHT
         mounting = self._mounting(result, triad) if turned else ()
         told = (f"the mounting is not in the numbers: {text}" for text in mounting)
-        return (*self._left_out(result, triad), *super().warnings(result), *told)
+        return (*doubt, *self._left_out(result, triad), *super().warnings(result), *told)
 
     def _mounting(self, result: Calibration, triad: Triad) -> tuple[str, ...]:
         return (triad.in_words(self.orientation),) if is_mounted(result) else ()

@@ -46,7 +46,7 @@ class Kalibr(DriverExporter):
         ]
         matrix = "".join(f"    - {row}\n" for row in base.rows(model.K))
         text = (
-            f"{base.comment(header)}imu{self.instance}:\n  model: scale-misalignment\n  accelerometers:\n    M:\n"
+            f"{base.comment(header)}imu{self.instance or 0}:\n  model: scale-misalignment\n  accelerometers:\n    M:\n"
             f"{matrix}    b: {base.rows(model.D)[0]}\n{UNKNOWN}"
         )
         return text.encode()

@@ -24,6 +24,7 @@ from accelcal_cli.io.vocabulary import (
     count_known,
     is_known,
     is_unit_row,
+    note_of_vehicle,
     parse_unit,
     read_facts,
 )
@@ -116,7 +117,9 @@ class Dialect:
         """Say what stands above the table and was understood of it, if anything does."""
         above, facts = self.above, str(self.facts)
         skipped = f"{above:,} line{'s' * (above != 1)} above the table skipped" if above else "comments"
-        return [skipped + f": {facts}" * bool(facts)] if above or facts else []
+        stated = skipped + f": {facts}" * bool(facts) if above or facts else ""
+        names = self.names if self.header_line and self.names else ()
+        return list(filter(None, [stated, note_of_vehicle(names)]))
 
 
 @frozen()
@@ -171,18 +174,18 @@ def to_number(cell: str, decimal_comma: bool) -> float | None:
 
 
 def understand(
-    head: bytes, source: str, skip: int = 0, prefix: str | None = None
+    head: bytes, source: str, skip: int = 0, prefix: str | None = None, accelerometer: str | None = None
 ) -> tuple[LineFilter | MessageFilter | None, Dialect]:
     """Return the dialect of a text, and the filter of its lines where its numbers stand among words.
 
     Args:
         head: its first bytes; source: named in messages; skip: lines at its beginning that are not looked at.
-        prefix: what the lines of readings begin with, None to find them.
+        prefix, accelerometer: what the lines of readings begin with, and which to read; None to find them.
 
     Raises:
         DataError: neither a table nor lines of readings.
     """
-    if b"FMT," in head[:OPENING] and (found := _of_messages(head, source, prefix)):
+    if b"FMT," in head[:OPENING] and (found := _of_messages(head, source, prefix, accelerometer)):
         return found
     dialect: Dialect | None = None
     fault: DataError | None = None
@@ -210,11 +213,11 @@ def understand(
     return words, replace(dialect, units=units, above=0)
 
 
-def _of_messages(head: bytes, source: str, wanted: str | None) -> tuple[MessageFilter, Dialect] | None:
+def _of_messages(head: bytes, source: str, *wanted: str | None) -> tuple[MessageFilter, Dialect] | None:
     """Return filter and dialect of an ArduPilot log, None for any other text."""
     from accelcal_cli.io.lines import find_messages
 
-    messages = find_messages(head, source, wanted)
+    messages = find_messages(head, source, *wanted)
     if messages is None:
         return None
     rows = (line for line in messages.translate(head).splitlines() if line.strip())

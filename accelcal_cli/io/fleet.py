@@ -21,7 +21,7 @@ from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
 from accelcal_cli.io.rows import RowBlock, ZeroRows, add_stretches, places, zero_rows
-from accelcal_cli.io.screening import LOOKED_AT, UNEQUAL, Screened, needs_look
+from accelcal_cli.io.screening import LOOKED_AT, ROW_WIDE, UNEQUAL, Screened, needs_look
 from accelcal_cli.io.stream import RowStore
 from accelcal_cli.notices import Notice
 
@@ -156,6 +156,7 @@ class FleetReadings:
             timed=origin.timed,
             count=_known(batch.behind, at, first),
             scatter=_known(batch.scatter, at, first),
+            zeros=sensor in self.zeros,
         )
         return (*screened.notices(), *zero_rows(*self.zeros.get(sensor, (0, "")), count))
 
@@ -166,6 +167,10 @@ class FleetReadings:
             doubtful |= (batch.scatter == 0).any(axis=(1, 2))
             noise = np.sqrt((batch.scatter**2).sum(axis=2) / (1.0 if batch.behind is None else batch.behind))
             doubtful |= noise.max(axis=1) > UNEQUAL * noise.min(axis=1)
+            real = (np.arange(batch.output.shape[1]) < batch.count[:, None])[..., None]
+            output = np.where(real, batch.output, np.nan)
+            extent = np.fmax.reduce(output, axis=1) - np.fmin.reduce(output, axis=1)
+            doubtful |= extent.max(axis=1) < ROW_WIDE * np.fmax.reduce(batch.scatter, axis=(1, 2))
         return np.asarray(doubtful | np.isin(batch.sensors, list(self.zeros)))
 
     def labelled(self, batch: Batch) -> Bool:

@@ -10,9 +10,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.vocabulary import AXES, FORCE_UNITS, describe, parse_unit
+
+if TYPE_CHECKING:
+    from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 RARE = 0.02
 """Part of the lines of a sample below which a kind is an accident."""
@@ -42,6 +46,7 @@ MESSAGE_UNITS = {
 }
 """Units of the columns of ArduPilot's messages of inertial sensors."""
 
+_SENSOR = re.compile(r"(IMU|ACC)(?:\[(\d+)\]|(\d+))?", re.IGNORECASE)
 _FORMAT = re.compile(rb"^FMT,\s*\d+,\s*\d+,\s*(\w+),\s*\w*,(.*)$", re.MULTILINE)
 _VALUE = re.compile(
     r"(?P<clock>(?<![\w.:])(?:\d{4}[-/]\d\d[-/]\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,:]\d+)?(?!\w|[.:]\d))"
@@ -108,6 +113,7 @@ class LineFilter:
         kinds: all kinds of the sample, the commonest first.
     """
 
+    correction: ClassVar[VehicleCorrection | None] = None
     kind: LineKind
     kinds: tuple[LineKind, ...]
     prefix: str = ""
@@ -122,14 +128,14 @@ class LineFilter:
         rest = without_prefix(line, self.prefix)
         return None if rest is None else self.kind.row(rest)
 
-    def note(self) -> str:
-        """Say what was taken of lines of several kinds, "" where there is one."""
+    def notes(self) -> tuple[str, ...]:
+        """Say what was taken of lines of several kinds, nothing where there is one."""
         others = [called(kind) for kind in self.kinds if kind is not self.kind]
         if not others:
-            return ""
+            return ()
         return (
             f"lines are of several kinds: {called(self.kind)} taken, {', '.join(others[:SHOWN])} left out; "
-            "--line PREFIX takes others"
+            "--line PREFIX takes others",
         )
 
     def _row(self, line: str) -> str:
@@ -148,11 +154,15 @@ class MessageFilter:
 
     Attributes:
         message: its name; columns: as its FMT line names them; others: messages with acceleration that are left out.
+        instance: the only value of the column I that is read, None for all.
+        correction: what ArduPilot had done to the readings.
     """
 
     message: str
     columns: tuple[str, ...]
     others: tuple[str, ...] = ()
+    instance: int | None = None
+    correction: VehicleCorrection | None = None
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -163,22 +173,32 @@ class MessageFilter:
         """Return a block of lines as rows: one line each, empty where it is of another message."""
         lead = f"{self.message},".encode()
         lines = block.split(b"\n")
-        return b"\n".join([line[len(lead) :].lstrip() if line.startswith(lead) else b"" for line in lines])
+        rows = [line[len(lead) :].lstrip() if line.startswith(lead) else b"" for line in lines]
+        if self.instance is not None:
+            at, own = self.columns.index("I"), b"%d" % self.instance
+            cells = (row.split(b",", at + 1) for row in rows)
+            met = [len(cell) > at and cell[at].strip() == own for cell in cells]
+            rows = [row if is_own else b"" for row, is_own in zip(rows, met, strict=True)]
+        return b"\n".join(rows)
 
-    def note(self) -> str:
-        """Say which message was taken."""
+    def notes(self) -> tuple[str, ...]:
+        """Say which message was taken, and what ArduPilot had done to the readings."""
         others = f", {', '.join(self.others)} left out; --line NAME takes others" if self.others else ""
-        return f"ArduPilot log: message {self.message} taken by its FMT line{others}"
+        taken = f"ArduPilot log: message {self.message} taken by its FMT line{others}"
+        return (taken,) if self.correction is None else (taken, self.correction.in_words())
 
 
-def find_messages(head: bytes, source: str, wanted: str | None = None) -> MessageFilter | None:
+def find_messages(
+    head: bytes, source: str, wanted: str | None = None, accelerometer: str | None = None
+) -> MessageFilter | None:
     """Return the filter of an ArduPilot log, None for any other text.
 
     Args:
         head: first bytes; source: named in messages; wanted: name of the message to take, None to find it.
+        accelerometer: the one to take, such as IMU2 or IMU[1], None to find it.
 
     Raises:
-        DataError: a log without such a message.
+        DataError: a log without such a message, or with several accelerometers and none stated.
     """
     formats = {
         match[1].decode(): tuple(name.strip() for name in match[2].decode(errors="replace").split(","))
@@ -188,17 +208,79 @@ def find_messages(head: bytes, source: str, wanted: str | None = None) -> Messag
         return None
     able = [name for name, columns in formats.items() if set(FORCE_COLUMNS) <= set(columns)]
     able = [name for name in able if re.search(rb"^%s," % name.encode(), head, re.MULTILINE)]
-    able.sort(key=lambda name: MESSAGES.index(name) if name in MESSAGES else len(MESSAGES))
+    able.sort(key=lambda name: (MESSAGES.index(name) if name in MESSAGES else len(MESSAGES), name))
     if wanted is None and not able:
         raise DataError(
             f"{source}: is an ArduPilot log without messages of acceleration (IMU or ACC); log them with LOG_BITMASK"
         )
-    message = able[0] if wanted is None else wanted.strip(" ,")
+    instance = None
+    if accelerometer is not None:
+        names = [name for message in able for name in _accelerometers(head, message, formats[message])]
+        message, bracket, number = choose_message(source, names, accelerometer).partition("[")
+        instance = int(number[:-1]) if bracket else None
+    else:
+        message = choose_message(source, able, None) if wanted is None else wanted.strip(" ,")
     if message not in formats:
         raise DataError(
             f'{source}: no FMT line defines a message "{message}" (--line); acceleration is in {" or ".join(able)}'
         )
-    return MessageFilter(message, formats[message], tuple(name for name in able if name != message))
+    others, columns = tuple(name for name in able if name != message), formats[message]
+    shown = _accelerometers(head, message, columns) if instance is None else [f"{message}[{instance}]"]
+    # The rows of several are refused later, unless --where chooses among them.
+    correction = _correction(head, shown[0]) if len(shown) == 1 and message in able else None
+    return MessageFilter(message, columns, others, instance, correction)
+
+
+def _accelerometers(head: bytes, message: str, columns: Sequence[str]) -> list[str]:
+    """Return the accelerometers whose rows one kind of message has, by the column I where there is one."""
+    if "I" not in columns:
+        return [message]
+    lines = re.findall(rb"^%s,(.*)$" % message.encode(), head, re.MULTILINE)
+    cells = (line.split(b",") for line in lines)
+    at = columns.index("I")
+    numbers = {row[at].strip() for row in cells if len(row) > at}
+    return [f"{message}[{int(number)}]" for number in sorted(numbers) if number.isdigit()]
+
+
+def _correction(head: bytes, name: str) -> VehicleCorrection:
+    """Return what ArduPilot had done to the readings of an accelerometer, by the PARM lines."""
+    from accelcal_cli.io.formats.ardupilot import correction_by
+
+    match = _SENSOR.fullmatch(name)
+    instance = 0 if match is None else int(match[2] or int(match[3] or 1) - 1)
+
+    parameters: dict[str, float] = {}
+    changed: set[str] = set()
+    for found in re.finditer(
+        rb"^PARM,[^\n]*?\b((?:INS_|AHRS_)\w+),\s*([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)", head, re.MULTILINE
+    ):
+        label, value = found[1].decode(), float(found[2])
+        if parameters.setdefault(label, value) != value:
+            changed.add(label)
+    return correction_by(parameters, changed, instance)
+
+
+def choose_message(source: str, names: Sequence[str], wanted: str | None) -> str:
+    """Return the accelerometer of an ArduPilot log to read: those of IMU messages go before those of ACC messages.
+
+    Args:
+        source: named in messages; names: IMU, IMU2, ACC1, ... or, by the column I, IMU[0], IMU[1], ACC[0], ...
+        wanted: option --accelerometer; IMU2 and IMU[1] are the same.
+
+    Raises:
+        DataError: none, or several and none wanted. UsageError: no such one.
+    """
+    from accelcal_cli.io.formats.base import choose_accelerometer
+
+    if wanted is None:
+        first = next((kind for kind in MESSAGES if any(name.startswith(kind) for name in names)), "")
+        return choose_accelerometer(source, [name for name in names if name.startswith(first)], None)
+    if match := _SENSOR.fullmatch(wanted.strip()):
+        kind, k = match[1].upper(), int(match[2] or int(match[3] or 1) - 1)
+        numbered = match[2] or match[3]
+        able = [f"{kind}[{k}]", *([] if k else [kind]), f"{kind}{k + 1}"] if numbered else [kind]
+        wanted = next((name for name in able if name in names), wanted)
+    return choose_accelerometer(source, names, wanted)
 
 
 def called(kind: LineKind) -> str:

@@ -1,23 +1,27 @@
-"""Parquet tables, read with polars; Parquet logs rewritten as Parquet or as text, and text logs as Parquet."""
+"""Tables whose columns have types, Parquet and Arrow, read with polars; logs written as Parquet, or as text."""
 
 from __future__ import annotations
 
+import struct
 import tempfile
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import numpy as np
 import polars as pl
 
-from accelcal_cli.errors import DataError
+from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.io.formats.base import NativeTable, RandomAccess, no_room
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection, TextTable
 from accelcal_cli.io.rewrite import Change, system_errors
 from accelcal_cli.io.rows import RowBlock, RowFilter
-from accelcal_cli.io.stream import BackgroundThread, ByteSource
+from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.io.vocabulary import Facts
 
 ROWS = 500_000
@@ -25,6 +29,15 @@ ROWS = 500_000
 
 WHOLE, NAME_OF_DIGITS = r"^-?(0|[1-9][0-9]*)$", r"^-?0[0-9]"
 """Cells that are whole numbers, and cells such as 007, which are names though they are digits."""
+
+ARROW_FILE, ARROW_STREAM = b"ARROW1", b"\xff\xff\xff\xff"
+"""How a file begins, and every message."""
+
+ARROW_END = ARROW_STREAM + b"\0\0\0\0"
+"""What ends a stream."""
+
+DICTIONARY, BATCH = 2, 3
+"""Kinds of messages with rows, or what rows refer to."""
 
 Cells = TypeVar("Cells", pl.Series, pl.Expr)
 
@@ -35,52 +48,51 @@ PREVIEW = 2000
 """Rows that the columns are told by where their names do not."""
 
 
-class ParquetTable:
-    """A Parquet file, streamed a batch of rows at a time."""
+class FrameTable(ABC):
+    """A table whose columns have types, read as frames of polars."""
 
+    names: tuple[str, ...]
+    numeric: tuple[bool, ...]
     has_rows: bool
     units: tuple[str, ...] | None = None
     facts = Facts()
-    source_format = "parquet"
+    correction = None
     notes: tuple[str, ...] = ()
     rows_skipped = 0
     lenient = False  # its cells have types: none is broken
+    source_format: str
 
-    def __init__(self, source: ByteSource, path: Path | None) -> None:
-        """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
+    def __init__(self, source: ByteSource) -> None:
+        """Take over the source."""
         self.name = source.name
         self.filter: RowFilter | None = None
         self._source = source
-        self._hashing = BackgroundThread()
-        self._files = ExitStack()
-        try:
-            self._path = path or self._copy()
-            with _named_errors(self.name):
-                frame = pl.scan_parquet(self._path)
-                schema = frame.collect_schema()
-                self.has_rows = bool(frame.head(1).collect().height)
-        except BaseException:
-            self._files.close()
-            raise
-        if source.hashed:
-            self._hashing.start(lambda: deque(source.rest(), maxlen=0))
-        self.names: tuple[str, ...] = tuple(schema)
+
+    @abstractmethod
+    def _head(self) -> pl.DataFrame:
+        """Return the first rows, PREVIEW at most."""
+
+    @abstractmethod
+    def _batches(self, wanted: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the rows with the columns that are wanted, in blocks."""
+
+    def _take(self, schema: pl.Schema) -> None:
+        """Take over names and types of the columns."""
+        self.names = tuple(schema)
         self.numeric = tuple(kind.is_numeric() for kind in schema.values())
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of the file."""
-        self._hashing.wait()
+        """SHA-256 of the input."""
+        deque(self._source.rest(), maxlen=0)
         return self._source.sha256
 
-    def leave_out(self, row: int) -> None:
+    def leave_out(self, row: int) -> None:  # noqa: B027
         """Never called: no row is broken."""
 
     def preview(self) -> list[list[str]]:
         """Return the cells of those of the first rows that are read."""
-        with _named_errors(self.name):
-            frame = pl.scan_parquet(self._path).head(PREVIEW).collect()
-        rows = (["" if cell is None else str(cell) for cell in row] for row in frame.iter_rows())
+        rows = (["" if cell is None else str(cell) for cell in row] for row in self._head().iter_rows())
         return [cells for cells in rows if self.filter is None or self.filter.meets(cells)]
 
     def keep_only(self, rows: RowFilter) -> None:
@@ -100,10 +112,9 @@ class ParquetTable:
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
-        lazy, start, read = pl.scan_parquet(self._path).select(wanted or self.names), 0, 0
-        while not (frame := self._batch(lazy, read)).is_empty():
-            read += frame.height
-            frame = frame if self.filter is None else self.filter.rows(frame)
+        start = 0
+        for whole in self._batches(wanted or self.names):
+            frame = whole if self.filter is None else self.filter.rows(whole)
             numbers = np.empty((frame.height, len(selection.numbers)))
             for k, column in enumerate(selection.numbers):
                 series = frame[self.names[column]].cast(pl.Float64).fill_null(float("nan"))
@@ -124,27 +135,8 @@ class ParquetTable:
         return lambda row: _row(lines.line(row + 1) - 1)
 
     def close(self) -> None:
-        """Remove the copy and close the file."""
-        self._source.stop()
-        self._hashing.wait()
+        """Close the file."""
         self._source.close()
-        self._files.close()
-
-    def _copy(self) -> Path:
-        try:
-            copy = tempfile.NamedTemporaryFile(prefix="accelcal-", suffix=".parquet")  # noqa: SIM115
-            self._files.enter_context(copy)
-            copy.write(self._source.head)
-            for block in self._source.rest():
-                copy.write(block)
-            copy.flush()
-        except OSError as problem:
-            raise no_room(self.name, problem) from problem
-        return Path(copy.name)
-
-    def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
-        with _named_errors(self.name):
-            return lazy.slice(start, ROWS).collect()
 
     def _check(self, numbers: np.ndarray, start: int, column: int, gaps: bool) -> None:
         bad = ~(np.abs(numbers) <= LIMIT) & ~(np.isnan(numbers) & gaps)
@@ -170,28 +162,195 @@ class ParquetTable:
         return f'{self.name}, {self.where(row)}, column "{self.names[column]}"'
 
 
+class ParquetTable(FrameTable):
+    """A Parquet file, streamed a batch of rows at a time."""
+
+    source_format = "parquet"
+    form = "Parquet"
+
+    def __init__(self, source: ByteSource, path: Path | None) -> None:
+        """Read the schema. Without a `path` (standard input) make a copy: the schema is at the end of the file."""
+        super().__init__(source)
+        self._file = RandomAccess(source, path, f".{self.source_format}")
+        self._path = self._file.path
+        try:
+            with _named_errors(self.name, self.form):
+                frame = self._scan(self._path)
+                self._take(frame.collect_schema())
+                self.has_rows = bool(frame.head(1).collect().height)
+        except BaseException:
+            self._file.close()
+            raise
+
+    @staticmethod
+    def _scan(path: Path) -> pl.LazyFrame:
+        return pl.scan_parquet(path)
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the file."""
+        self._file.wait()
+        return self._source.sha256
+
+    def _head(self) -> pl.DataFrame:
+        with _named_errors(self.name, self.form):
+            return self._scan(self._path).head(PREVIEW).collect()
+
+    def _batches(self, wanted: Sequence[str]) -> Iterator[pl.DataFrame]:
+        lazy, read = self._scan(self._path).select(wanted), 0
+        while not (frame := self._batch(lazy, read)).is_empty():
+            read += frame.height
+            yield frame
+
+    def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
+        with _named_errors(self.name, self.form):
+            return lazy.slice(start, ROWS).collect()
+
+    def close(self) -> None:
+        """Remove the copy and close the file."""
+        self._file.close()
+        super().close()
+
+
+class ArrowTable(ParquetTable):
+    """A file of Arrow IPC, whose schema is at its end, too."""
+
+    source_format = "arrow"
+    form = "Arrow"
+
+    @staticmethod
+    def _scan(path: Path) -> pl.LazyFrame:
+        return pl.scan_ipc(path)
+
+
+class ArrowStream(FrameTable):
+    """A stream of Arrow IPC, a record batch at a time.
+
+    Each record batch is given to polars behind the schema and the dictionaries (arrow.apache.org, Serialization and
+    Interprocess Communication): polars itself reads a whole stream into memory.
+    """
+
+    source_format = "arrow"
+
+    def __init__(self, source: ByteSource) -> None:
+        """Read the schema and the first record batch."""
+        super().__init__(source)
+        with _named_errors(self.name, "Arrow"):
+            self._frames = self._read(ArrowMessages(chain([source.head], source.rest())))
+            self._first = next(self._frames)
+            while self._first.is_empty() and (frame := next(self._frames, None)) is not None:
+                self._first = frame
+        self._take(self._first.schema)
+        self.has_rows = not self._first.is_empty()
+
+    @staticmethod
+    def _read(messages: ArrowMessages) -> Iterator[pl.DataFrame]:
+        """Yield first an empty frame with the schema, then the record batches."""
+        before = [next(messages)[1]]
+        yield pl.read_ipc_stream(b"".join([*before, ARROW_END]))
+        for kind, data in messages:
+            if kind == DICTIONARY:
+                before.append(data)
+            elif kind == BATCH:
+                yield pl.read_ipc_stream(b"".join([*before, data, ARROW_END]))
+
+    def _head(self) -> pl.DataFrame:
+        return self._first.head(PREVIEW)
+
+    def _batches(self, wanted: Sequence[str]) -> Iterator[pl.DataFrame]:
+        frames = chain([self._first], self._frames)
+        while True:
+            with _named_errors(self.name, "Arrow"):
+                frame = next(frames, None)
+            if frame is None:
+                return
+            for start in range(0, frame.height, ROWS):
+                yield frame.slice(start, ROWS).select(wanted)
+
+
+class ArrowMessages:
+    """The messages of an Arrow stream in blocks of bytes: kind, and the message with its body."""
+
+    def __init__(self, blocks: Iterable[bytes]) -> None:
+        """Take over the bytes."""
+        self._blocks, self._rest = iter(blocks), b""
+
+    def __iter__(self) -> Iterator[tuple[int, bytes]]:
+        """Return itself."""
+        return self
+
+    def __next__(self) -> tuple[int, bytes]:
+        """Return the next message; ValueError where it is cut off or none."""
+        if not (lead := self._peek(8)) or lead.startswith(ARROW_END):
+            raise StopIteration
+        mark, size = struct.unpack("<4si", lead)
+        if mark != ARROW_STREAM or size <= 0:
+            raise ValueError("no message begins where one should")
+        meta = self._peek(8 + size)[8:]
+        (table,) = struct.unpack_from("<I", meta)
+        (back,) = struct.unpack_from("<i", meta, table)
+        entries, _, _, kind, _, body = struct.unpack_from(
+            "<6H", meta, table - back
+        )  # of a FlatBuffers vtable
+        length = struct.unpack_from("<q", meta, table + body)[0] if entries > 10 and body else 0
+        if length < 0:
+            raise ValueError("a message has a negative length")
+        return meta[table + kind], self._next(8 + size + length)
+
+    def _peek(self, size: int) -> bytes:
+        """Return the next bytes, none at the end of the input."""
+        parts, length = [self._rest], len(self._rest)
+        while length < size and (block := next(self._blocks, None)) is not None:
+            parts.append(block)
+            length += len(block)
+        self._rest = b"".join(parts) if len(parts) > 1 else self._rest
+        if 0 < len(self._rest) < size:
+            raise ValueError("it is cut off")
+        return self._rest[:size]
+
+    def _next(self, size: int) -> bytes:
+        data = self._peek(size)
+        self._rest = self._rest[size:]
+        return data
+
+
+def open_typed(source: ByteSource, path: Path | None, accelerometer: str | None = None) -> FrameTable:
+    """Return a table in Parquet or Arrow; `path` is None for standard input and what was packed.
+
+    Raises:
+        UsageError: an accelerometer was asked for, which a table does not tell apart. DataError: it cannot be read.
+    """
+    if accelerometer is not None:
+        raise UsageError(
+            f'--accelerometer "{accelerometer}": {source.name} is a table; use --columns or --where'
+        )
+    if source.head.startswith(ARROW_STREAM):
+        return ArrowStream(source)
+    return (ArrowTable if source.head.startswith(ARROW_FILE) else ParquetTable)(source, path)
+
+
 def _row(row: int) -> str:
     return f"row {row + 1}"
 
 
-def no_room(name: str, problem: OSError) -> DataError:
-    """Return what to raise where a working copy of an input cannot be written."""
-    return DataError(f"{name}: no room for a working copy in {tempfile.gettempdir()} ({problem.strerror})")
-
-
 @contextmanager
-def _named_errors(name: str) -> Iterator[None]:
+def _named_errors(name: str, form: str) -> Iterator[None]:
     """Raise what polars finds wrong with a file as DataError; a panic of its decoder is no subclass of its errors."""
     try:
         yield
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as problem:
-        reason = str(problem).strip().splitlines()[0][:200]
-        raise DataError(f"{name}: cannot be read as Parquet ({reason})") from problem
+    except DataError:
+        raise
+    except (
+        *(pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError),
+        *(ValueError, IndexError, struct.error, MemoryError, StopIteration),
+    ) as problem:
+        reason = (str(problem).strip() or type(problem).__name__).splitlines()[0][:200]
+        raise DataError(f"{name}: cannot be read as {form} ({reason})") from problem
 
 
 def frames(table: InputTable, change: Change) -> Iterator[pl.DataFrame]:
     """Yield the changed log, block after block."""
-    assert isinstance(table, ParquetTable)
+    assert isinstance(table, FrameTable | NativeTable)
     for frame, rows in table.pairs(change.selection):
         yield _changed(frame, rows, change)
 
@@ -217,7 +376,7 @@ def to_parquet(table: InputTable, change: Change, file: IO[bytes]) -> None:
         OSError: it cannot be written.
     """
     target = file.name if isinstance(file.name, str) else file  # an open descriptor has a number for a name
-    if isinstance(table, ParquetTable):
+    if isinstance(table, FrameTable | NativeTable):
         with system_errors():
             _sink(frames(table, change), target)
         return

@@ -1,8 +1,7 @@
 """Numeric tables as streams of row blocks: one interface for text of any dialect and for Parquet.
 
-`open_table` gives a `Table`. A `TextTable` is read by two parsers: `CarefulParser` goes line by line in Python, defines
-what a table means and names the cell that is wrong; `FastParser` lets polars read whole blocks wherever that is sure to
-mean the same. Short inputs never import polars. Parquet has its own file, which is nothing without polars.
+A `TextTable` is read by two parsers: `CarefulParser` goes line by line in Python, defines what a table means and names
+the cell that is wrong; `FastParser` lets polars read whole blocks wherever that is sure to mean the same.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import numpy as np
 
-from accelcal_cli.errors import DataError
+from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.dialect import (
     BOM,
     MARKS,
@@ -34,12 +33,14 @@ from accelcal_cli.io.dialect import (
     understand,
 )
 from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
-from accelcal_cli.io.stream import LONGEST_LINE, ByteSource, open_source
+from accelcal_cli.io.stream import LONGEST_LINE, TYPED, ByteSource, open_source
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 LIMIT = 1e100
 """Largest reading: greater values cannot be squared safely."""
@@ -63,6 +64,7 @@ class ReadOptions:
         line: what the lines of readings begin with, among lines of several kinds; None to find them by their words.
         count: the column of counts, or ``none``; None to find it by its name.
         where: conditions that the rows to read meet, each as COLUMN=VALUE.
+        accelerometer: the one to read of a log that has several, by the name that the log gives it.
     """
 
     skip_rows: int = 0
@@ -70,6 +72,7 @@ class ReadOptions:
     line: str | None = None
     count: str | None = None
     where: tuple[str, ...] = ()
+    accelerometer: str | None = None
 
 
 PLAIN = ReadOptions()
@@ -81,9 +84,8 @@ class Selection:
 
     numbers: tuple[int, ...]
     gaps: frozenset[int] = frozenset()  # columns whose cells may be empty, or nan where they are numbers
-    texts: tuple[
-        int, ...
-    ] = ()  # columns read as text: labels, which no row may lack unless they are among the gaps
+    # Columns read as text: labels, which no row may lack unless they are among the gaps.
+    texts: tuple[int, ...] = ()
     needed: tuple[int, ...] = ()  # a line where all of these are empty is no row: that of another sensor
     carried: frozenset[int] = frozenset()  # columns of a slower sensor: an empty cell takes the last value
 
@@ -120,7 +122,11 @@ class InputTable(Protocol):
 
     @property
     def source_format(self) -> str:
-        """How the input is written: ``csv``, whatever separates its columns, or ``parquet``."""
+        """How the input is written: ``csv``, whatever separates its columns, ``parquet``, or a native format's name."""
+
+    @property
+    def correction(self) -> VehicleCorrection | None:
+        """What a vehicle had done to the readings that it logged; None where it is no log of a vehicle."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -168,10 +174,14 @@ def open_table(
     """Open a table of any supported form; ``-`` is standard input. Without the hash it is read a little faster."""
     stream, path = open_source(source, stdin, hashed=hashed), None if str(source) == "-" else Path(source)
     try:
-        if stream.head.startswith(b"PAR1") or (path and path.suffix.lower() in {".parquet", ".pq"}):
-            from accelcal_cli.io.parquet import ParquetTable
+        if stream.head.startswith(TYPED) or (path and path.suffix.lower() in {".parquet", ".pq"}):
+            from accelcal_cli.io.parquet import open_typed
 
-            return ParquetTable(stream, None if stream.forms else path)
+            return open_typed(stream, None if stream.forms else path, options.accelerometer)
+        if stream.native is not None:
+            from accelcal_cli.io.formats.base import NativeTable
+
+            return NativeTable(stream, None if stream.forms else path, options)
         return TextTable(stream, options)
     except BaseException:
         stream.close()
@@ -185,7 +195,11 @@ class TextTable:
         """Find the dialect of `source` from its head."""
         self.name = source.name
         self._source, self._options = source, options
-        self._words, self.dialect = understand(source.head, source.name, options.skip_rows, options.line)
+        form = options.skip_rows, options.line, options.accelerometer
+        self._words, self.dialect = understand(source.head, source.name, *form)
+        self.correction = None if self._words is None else self._words.correction
+        if (sensor := options.accelerometer) is not None and self.correction is None:
+            raise UsageError(f'--accelerometer "{sensor}": {self.name} is a table; use --columns or --where')
         self.names, self.units, self.facts = self.dialect.names, self.dialect.units, self.dialect.facts
         cells = self.dialect.first + ("",) * (self.dialect.width - len(self.dialect.first))
         self.numeric = tuple(looks_numeric(cell) for cell in cells[: self.dialect.width])
@@ -218,8 +232,7 @@ class TextTable:
         if self._options.skip_rows:
             notes.append(f"the first {self._options.skip_rows:,} lines skipped (--skip-rows)")
         notes += self.dialect.notes()
-        if self._words is not None and (note := self._words.note()):
-            notes.append(note)
+        notes += () if self._words is None else self._words.notes()
         return (*notes, *self.passed.notes())
 
     def leave_out(self, row: int) -> None:
@@ -228,8 +241,8 @@ class TextTable:
 
     def preview(self) -> list[list[str]]:
         """Return the cells of some rows of the head that are read, spread over it."""
-        lines = [text for text in self._sample if not is_comment(text, self.dialect.marks)]
-        rows = [split_cells(text, self.dialect.separator) for text in lines]
+        marks, separator = self.dialect.marks, self.dialect.separator
+        rows = [split_cells(text, separator) for text in self._sample if not is_comment(text, marks)]
         whole = [cells for cells in rows if len(cells) >= self.dialect.width]
         return [cells for cells in whole if self.filter is None or self.filter.meets(cells)]
 
@@ -274,9 +287,8 @@ class TextTable:
         careful.check_passed()
 
     def _kept(self, block: bytes, *, top: bool = False) -> bytes:
-        if self.filter is None:
-            return block
-        return self.filter.keep_all(block) if top else self.filter.keep(block, self.dialect)
+        rows = self.filter
+        return block if rows is None else rows.keep_all(block) if top else rows.keep(block, self.dialect)
 
     @property
     def where(self) -> Callable[[int], str]:
@@ -490,9 +502,8 @@ class FastParser:
         series = [] if frame is None else [frame[str(column)] for column in selection.numbers]
         if frame is None or any(column.null_count() for column in series):
             return None
-        numbers = np.array(
-            [column.to_numpy() for column in series]
-        ).T  # column after column: faster to reduce
+        # Column after column, which is faster to reduce.
+        numbers = np.array([column.to_numpy() for column in series]).T
         if series and not (numbers.min() >= -LIMIT and numbers.max() <= LIMIT):  # nan fails both
             return None
         texts = tuple(frame[str(k)].str.strip_chars().fill_null("").to_list() for k in selection.texts)

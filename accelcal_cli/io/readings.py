@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import BinaryIO, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,9 @@ from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
 from accelcal_cli.io.stream import IN_MEMORY, RowStore
 from accelcal_cli.notices import Notice
 from accelcal_cli.schema import frozen
+
+if TYPE_CHECKING:
+    from accelcal_cli.sensor.vehicle import VehicleCorrection
 
 HEAD = 1024
 """Rows of labelled poses that are kept to see in what steps the readings come."""
@@ -47,6 +50,7 @@ class InputForm:
         rows: read, without those skipped; rows_skipped: broken ones left out.
         rate_hz: rows per second of a log, None where it is unknown.
         unit: of the readings as the file states it: g, mg, m/s^2 or counts; None where it does not.
+        correction: what a vehicle had done to the readings that it logged; None where it is no log of a vehicle.
     """
 
     source_format: str = "array"
@@ -54,6 +58,7 @@ class InputForm:
     rows_skipped: int = 0
     rate_hz: float | None = None
     unit: str | None = None
+    correction: VehicleCorrection | None = None
 
 
 @frozen(eq=False)
@@ -73,6 +78,7 @@ class Readings:
         notes: what the reader did that a user should know.
         warnings: why the readings may not be what they are taken for.
         form: how the input is written.
+        in_time: whether the poses follow each other in time, so that neighbours may share errors.
     """
 
     source: str
@@ -90,6 +96,7 @@ class Readings:
     notes: tuple[str, ...] = ()
     warnings: tuple[Notice, ...] = ()
     form: InputForm = InputForm()
+    in_time: bool = False
     _store: RowStore = field(default_factory=RowStore, repr=False)
     _line: Callable[[int], str] | None = field(default=None, repr=False)
 
@@ -207,7 +214,12 @@ def read_readings(
             collector.add(rows)
         collector.notes[:0] = table.notes
         form = InputForm(
-            table.source_format, collector.rows, table.rows_skipped, None, collector.columns.unit
+            table.source_format,
+            collector.rows,
+            table.rows_skipped,
+            None,
+            collector.columns.unit,
+            table.correction,
         )
         return collector.readings(table.sha256, table.where, form)
     finally:
@@ -332,6 +344,7 @@ class Collector:
             count=None if count is None else count[: len(first)],
             scatter=None if scatter is None else scatter[: len(first)],
             behind=self._behind,
+            zeros=bool(self.zeros.count),
         )
 
     def _line_of(self, where: Callable[[int], str]) -> Callable[[int], str]:

@@ -245,6 +245,21 @@ class RowFilter:
         self._note(np.flatnonzero(mask), len(mask))
         return frame.filter(met)
 
+    def keep_numbers(self, rows: Float) -> Bool:
+        """Return which rows, shape (B, k), of numbers meet the conditions, shape (B,)."""
+        mask = np.ones(len(rows), dtype=bool)
+        for condition in self.conditions:
+            try:
+                mask &= rows[:, condition.column] == float(condition.value)
+            except ValueError:
+                mask[:] = False
+        if len(self._seen) <= VALUES:
+            values = dict.fromkeys(rows[:, self.conditions[0].column].tolist())
+            self._seen.update((f"{value:g}", None) for value in list(values)[: VALUES + 1])
+        self._met |= bool(mask.any())
+        self._note(np.flatnonzero(mask), len(mask))
+        return mask
+
     def meets(self, cells: Sequence[str]) -> bool:
         """Return whether a whole row meets the conditions."""
         return all(condition.holds(cells[condition.column]) for condition in self.conditions)

@@ -63,6 +63,9 @@ NO_SURFACE = 0.25
 """Poses fill a volume, and lie on no sphere, when they scatter about it by this part of their largest extent: noise
 does so by 0.26 to 0.6, caps of 20 degrees with 20 mg of noise by less than 0.23."""
 
+ROW_WIDE, FEW_STEPS = 3.0, 8
+"""Extent of poses that are nothing but noise: in standard deviations of a row, and in steps of the readings."""
+
 NO_SPHERE = 0.2
 """The squared radius of poses brought to unit extent scatters less about that of a sphere, where they lie on one."""
 
@@ -138,6 +141,7 @@ class Screened:
         warm: whether they have temperatures, with which one sensor may drift from the first half to the second.
         count: readings behind each pose, shape (J,); scatter: standard deviation of one, shape (J, 3); or None.
         behind: the readings behind the poses; None where they are not known.
+        zeros: whether rows of zeros have been left out.
     """
 
     output: Float
@@ -151,6 +155,7 @@ class Screened:
     count: Float | None = None
     scatter: Float | None = None
     behind: Behind | None = None
+    zeros: bool = False
 
     def notices(self) -> tuple[Notice, ...]:
         """Return what the readings show, warnings first."""
@@ -224,8 +229,16 @@ class Screened:
 
     @property
     def gravity_removed(self) -> bool:
-        """Whether the poses fill a volume instead of a surface."""
-        return self.ties.surface is not None and thickness(self.output) > NO_SURFACE and self._is_one_blob()
+        """Whether the poses fill a volume instead of a surface, or lie within the noise of a row."""
+        extent = np.ptp(self.output, axis=0)
+        if extent.max() < ROW_WIDE * self._usual_scatter.max():
+            return True
+        steps = np.array([coarsest_step(axis) for axis in self.output.T])
+        few = bool((extent <= FEW_STEPS * steps).all())
+        if few and self.zeros:
+            return True
+        volume = self.ties.surface is not None and thickness(self.output) > NO_SURFACE
+        return volume and (few or self._is_one_blob())
 
     def _is_one_blob(self) -> bool:
         """Whether distances from the middle spread as those of noise, not as those of a sphere with a few outliers."""

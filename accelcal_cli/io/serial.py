@@ -123,7 +123,7 @@ def readings(
         columns = range(1, 4)
         tell(f"{source}: the first number of each line taken as time: it increases")
     columns = columns or range(3)
-    if kinds is not None and (note := kinds.note()):
+    for note in () if kinds is None else kinds.notes():
         tell(f"{source}: {note}")
     unread = 0
     for text in chain(first, texts):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import codecs
 import hashlib
+import io
 import os
 import sys
 import weakref
@@ -28,6 +29,8 @@ from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
     from zipfile import ZipFile
+
+    from accelcal_cli.io.formats.base import LogFormat
 
 HEAD = 4 << 20
 """Bytes of the first block: an input up to this size is one block and never needs polars."""
@@ -56,11 +59,23 @@ _FOREIGN = {  # first bytes of files that users pass instead of text
     b"BZh": "bzip2-compressed; unpack it first",
     b"\xfd7zXZ": "xz-compressed; unpack it first",
     b"7z\xbc\xaf": "a 7-Zip archive; unpack it first",
-    b"\xa3\x95\x80\x80": "a binary ArduPilot log; convert it with mavlogdump.py --format csv --types IMU",
-    b"ULog": "a binary PX4 log; convert it with ulog2csv",
     b"%PDF": "a PDF document; export the readings as CSV",
     b"SQLite": "an SQLite database; export the readings as CSV",
 }
+
+_NATIVE = (  # first bytes of native logs that may have no zero byte soon; all others have one
+    b"MD",
+    b"PK\x03\x04",
+    b"\xa3\x95",
+    b"#ROSBAG",
+    b"Device Identity",
+)
+
+TYPED = (b"PAR1", b"ARROW1", b"\xff\xff\xff\xff")
+"""First bytes of Parquet, and of Arrow as a file and as a stream."""
+
+_NOT_NATIVE = (*TYPED, b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff")
+"""First bytes of these, of gzip and UTF-16, which have zero bytes and are no native logs."""
 
 _Digest = Callable[[bytes], None]
 
@@ -77,6 +92,8 @@ class ByteReader(Protocol):
 
 class ByteSource:
     """One pass over a file or standard input; `sha256` covers the bytes read so far, `forms` how they were packed.
+
+    `native` is the format of a native log, None for text and Parquet.
 
     Hashing runs in the background of the parser: at 10 million rows it would otherwise take as long as the parsing.
     """
@@ -116,7 +133,11 @@ class ByteSource:
         else:
             self._hash.update(raw)
         self.whole = len(raw) < head  # the head is all there is
-        self._carriage_returns = b"\n" not in raw and b"\r" in raw[:-1]  # line ends of old Macs
+        self.native = find_native(raw)
+        binary = self.native is not None or raw.startswith(TYPED)
+        self._carriage_returns = (
+            not binary and b"\n" not in raw and b"\r" in raw[:-1]
+        )  # line ends of old Macs
         self.head = self._unify(raw)
 
     def stop(self) -> None:
@@ -195,6 +216,10 @@ def open_source(source: str | Path, stdin: BinaryIO | None = None, *, hashed: bo
     except FileNotFoundError as problem:
         raise DataError(f"{source}: no such file{_neighbour(path)}") from problem
     except IsADirectoryError as problem:
+        if (path / "metadata.yaml").is_file():
+            from accelcal_cli.io.formats.ros import BagFolder
+
+            return ByteSource(io.BufferedReader(BagFolder(path)), str(source), owned=True, hashed=hashed)
         raise DataError(f"{source}: is a directory; a file of readings was expected") from problem
     except PermissionError as problem:
         raise DataError(f"{source}: no permission to read it") from problem
@@ -218,7 +243,7 @@ def _neighbour(path: Path) -> str:
 
 @frozen()
 class Unpacked:
-    """A stream of plain text or Parquet.
+    """A stream of plain text, of Parquet or of a native log.
 
     Attributes:
         stream: to read on from, its first bytes included.
@@ -254,8 +279,19 @@ def unpack(stream: ByteReader, head: bytes, name: str, digest: _Digest) -> Unpac
     return Unpacked(source, tuple(forms))
 
 
+def find_native(head: bytes) -> type[LogFormat] | None:
+    """Return the format of a native log by its first bytes, None for anything else; no format is loaded for text."""
+    if head.startswith(_NOT_NATIVE) or not (b"\0" in head[:PEEKED] or head.startswith(_NATIVE)):
+        return None
+    from accelcal_cli.io.formats.base import recognise
+
+    return recognise(head)
+
+
 def _layer(head: bytes, name: str) -> tuple[str, Callable[[ByteReader, str], ByteReader]] | None:
     """Return the outermost packing of some bytes and how to undo it."""
+    if find_native(head) is not None:
+        return None
     for magic, what in _FOREIGN.items():
         if head.startswith(magic):
             raise DataError(f"{name}: is {what}")
@@ -263,7 +299,7 @@ def _layer(head: bytes, name: str) -> tuple[str, Callable[[ByteReader, str], Byt
         return "gzip", _Gunzipped
     if head.startswith(b"PK\x03\x04"):
         return "zip", _Member
-    if head.startswith(b"PAR1"):
+    if head.startswith(TYPED):
         return None
     encoding = _encoding(head)
     return None if encoding is None else (encoding[0], lambda stream, _: _Transcoded(stream, encoding[1]))

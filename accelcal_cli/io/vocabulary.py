@@ -164,6 +164,7 @@ _ALONE = {
 }
 """Roles of single columns, by their names without separators; those of `other` are not readings."""
 
+_STAMPS = frozenset({"TimeUS", "TimeMS"})
 _TIME = r"(?:t|time|timestamp|stamp|sec|seconds)(?:ns|us|usec|ms|msec)?"
 _SENSOR_PERHAPS = r"id|uid|uuid|name|unit|part|chip|module|node|board|accelerometer"
 
@@ -500,6 +501,20 @@ def listed(names: Sequence[str], columns: Sequence[int], between: str = ", ") ->
 def bare_name(name: str) -> str:
     """Return a name without unit, in lower case."""
     return "".join(tokens_of(name))
+
+
+def note_of_vehicle(names: Sequence[str]) -> str:
+    """Return what to say of a table whose columns a vehicle has corrected; "" of any other."""
+    if "accelerometer_m_s2[0]" in names:
+        vehicle, own = "PX4", "CAL_ACC"
+    elif {"AccX", "AccY", "AccZ"} <= set(names) and not _STAMPS.isdisjoint(names):
+        vehicle, own = "ArduPilot", "INS_ACC"
+    else:
+        return ""
+    return (
+        f"{vehicle} corrected the readings by its {own} parameters, which a table does not hold: an export corrects "
+        "what the vehicle has corrected; calibrate the log itself"
+    )
 
 
 def is_kind(name: str) -> bool:

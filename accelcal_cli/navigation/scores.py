@@ -155,7 +155,7 @@ def judge(
         found.append(Notice("outliers", "warning", text, check))
     if disturbed > DOUBT:
         text = "Gravity fits the map only with a bias of the gravimeter or an error of the map."
-        found.append(Notice("disturbed", "note", text, check))
+        found.append(Notice("disturbed", "note", text))
     if not claimed <= initial:
         text = f"The position is not fixed: claimed sigma is {claimed:.0f} m, initial error {initial:.0f} m."
         found.append(Notice("fix", "warning", text, "Use a map with more relief, or a longer voyage."))

@@ -12,17 +12,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Float, Int
 from accelcal_cli.config import load_mapping, shipped
+from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import Checked, from_mapping, setting
+
+Randoms = Literal["coordinate", "particle"]
+"""Of which the random numbers of a swarm are its own: of every coordinate, or of a particle for all its coordinates."""
+
+RANDOMS = "random numbers of each pull: one per coordinate, or one per particle"
+"""Meaning of the setting `randoms`, which several swarms have."""
+
+PRESETS = ("printed", "tuned")
+"""printed: as the source prints it, as far as it does; tuned: what we would take. The names are a contract."""
 
 
 class Status(IntEnum):
@@ -144,6 +154,26 @@ def built(name: str, parameters: Mapping[str, Any]) -> Optimizer[State]:
         ConfigError: unknown optimizer or parameter, or one out of range.
     """
     return from_mapping(OPTIMIZERS.get(name), parameters, f"optimizer {name}")
+
+
+def preset_parameters(optimizer: str, preset: str) -> dict[str, Any]:
+    """Return the settings of a preset that differ from the defaults, from the optimizer's file.
+
+    Raises:
+        ConfigError: no such preset, or an optimizer whose file has none of that name.
+    """
+    OPTIMIZERS.get(optimizer)
+    if preset not in PRESETS:
+        raise ConfigError(
+            f'preset "{preset}": unknown{did_you_mean(preset, PRESETS)}; known: {", ".join(PRESETS)}'
+        )
+    path = optimizer_file(optimizer)
+    presets = load_mapping(path).get("presets", {}) if path else {}
+    if preset not in presets:
+        raise ConfigError(
+            f'optimizer "{optimizer}" has no preset "{preset}": leave it out, or state its parameters'
+        )
+    return dict(presets[preset] or {})
 
 
 def shipped_parameters(optimizer: object) -> dict[str, Any]:

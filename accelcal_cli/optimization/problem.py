@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from accelcal_cli.arrays import Float, Int
 
@@ -90,6 +91,35 @@ class Problem(ABC):
     def take(self, index: Int) -> Problem:  # noqa: ARG002
         """Return the problem of the runs at `index`; itself when all runs share one problem."""
         return self
+
+
+class FunctionProblem(Problem):
+    """Any function over a box.
+
+    Args:
+        function: of points, shape (..., D), that returns their costs, shape (...); see `numpy.vectorize` for one that
+            takes one point at a time.
+        lower, upper: the box, shape (D,).
+        name: for tables.
+
+        >>> import numpy as np
+        >>> from accelcal_cli.optimization.algorithms.de import DifferentialEvolution
+        >>> from accelcal_cli.optimization.minimize import minimize
+        >>> bowl = FunctionProblem(lambda x: ((x - 1.0) ** 2).sum(axis=-1), [-5.0, -5.0], [5.0, 5.0])
+        >>> minimize(bowl, DifferentialEvolution()).x.round(6)
+        array([[1., 1.]])
+    """
+
+    def __init__(
+        self, function: Callable[[Float], Float], lower: ArrayLike, upper: ArrayLike, name: str = "function"
+    ) -> None:
+        """Take the box as arrays."""
+        self.function, self.name = function, name
+        self.lower, self.upper = np.array(lower, dtype=float), np.array(upper, dtype=float)
+
+    def cost(self, x: Float) -> Float:
+        """Return the function at every point, shape (R, P)."""
+        return np.asarray(self.function(x), dtype=float)
 
 
 class Counted(Problem):

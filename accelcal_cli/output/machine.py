@@ -28,6 +28,34 @@ _STEERING = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 """Control characters that JSON may hold as they are, and that a terminal would obey."""
 
 
+SPECIAL = str.maketrans({
+    "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
+})  # fmt: skip
+"""What LaTeX takes for more than a character."""
+
+
+def latex_text(table: Table) -> str:
+    """Return a table as LaTeX with the rules of the package booktabs; its notes stand under it."""
+
+    left = [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
+    heads = [(f"{c.name} [{c.unit}]" if c.unit else c.name).translate(SPECIAL) for c in table.columns]
+    rows = [
+        [c.text(v).translate(SPECIAL) for c, v in zip(table.columns, row, strict=True)] for row in table.rows
+    ]
+    lines = [
+        f"\\begin{{tabular}}{{{''.join('l' if word else 'r' for word in left)}}}",
+        "\\toprule",
+        " & ".join(heads) + r" \\",
+        "\\midrule",
+        *(" & ".join(row) + r" \\" for row in rows),
+        "\\bottomrule",
+        "\\end{tabular}",
+        *(f"% {note}" for note in table.notes),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def write_csv(table: Table, file: IO[str]) -> None:
     """Write a table as CSV: keys of the columns, then rows; numbers with all their digits, nothing for none."""
     writer = csv.writer(file, lineterminator="\n")

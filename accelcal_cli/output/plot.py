@@ -30,7 +30,9 @@ ACROSS = 3
 """Panels side by side at most."""
 
 
-def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) -> None:
+def plot_convergence(
+    title: str, curves: Curves, tolerance: float, path: str, bands: tuple[Curves, Curves] | None = None
+) -> None:
     """Write one panel per function with one line per optimizer, whole or not at all.
 
     Args:
@@ -38,6 +40,7 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
         curves: evaluations and median cost by function and optimizer.
         tolerance: drawn as a thin line.
         path: ends in .png or .svg.
+        bands: lower and upper quartile of the same curves, drawn as a shade.
     """
     from matplotlib.lines import Line2D
 
@@ -50,9 +53,32 @@ def plot_convergence(title: str, curves: Curves, tolerance: float, path: str) ->
         panels = figure.subplots(down, across, squeeze=False).ravel()
         for axes, (name, panel) in zip(panels, curves.items(), strict=False):
             _panel(axes, name, panel, labels, tolerance)
+            if bands is not None:
+                _band(axes, labels, *(band[name] for band in bands))
         for axes in panels[len(curves) :]:
             axes.set_axis_off()
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(labels), 5), frameon=False)
+
+
+def _band(
+    axes: Axes,
+    labels: list[str],
+    lower: Mapping[str, tuple[Float, Float]],
+    upper: Mapping[str, tuple[Float, Float]],
+) -> None:
+    """Shade what lies between two curves of each optimizer."""
+    floor = axes.get_ylim()[0]
+    for label, (evaluations, low) in lower.items():
+        colour = line_style(labels.index(label))["color"]
+        high = upper[label][1]
+        axes.fill_between(
+            evaluations,
+            np.maximum(low, floor),
+            np.maximum(high, floor),
+            color=colour,
+            alpha=0.15,
+            linewidth=0,
+        )
 
 
 def _panel(

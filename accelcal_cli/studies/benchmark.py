@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.minimize import Stopping, minimize
+from accelcal_cli.optimization.minimize import Stopping
 from accelcal_cli.optimization.optimizer import Status
+from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.studies.functions import TestFunction
+from accelcal_cli.studies.runtimes import REDUCTIONS, Targeted, expected_running_time, hits_of
 from accelcal_cli.studies.study import (
     Entry,
     Record,
@@ -27,6 +31,7 @@ from accelcal_cli.studies.study import (
     Task,
     records_of,
     records_of_cell,
+    spread,
 )
 
 NEEDS = {"residuals": "residuals (a sum of squares)", "closed_form": "a closed form"}
@@ -39,17 +44,20 @@ class Benchmark(Study):
     Attributes:
         functions: names of test functions.
         entries: the optimizers.
-        dimensions: D.
+        dimensions: D, one or several.
         runs: of each cell; seed: of all of them.
         tolerance: a run succeeds when its cost is at or below this.
         evaluations: budget per run; None leaves it to the iterations.
         stop: whether a run ends when it reaches the tolerance.
         shift, rotate: move the optimum, rotate the coordinates.
+        instances: so many places and rotations, run by run in turn; 0 is the plain function, or the one that `shift`
+            and `rotate` say.
+        targets: costs whose running time is told; none is the tolerance.
     """
 
     functions: tuple[str, ...]
     entries: tuple[Entry, ...]
-    dimensions: int = 12
+    dimensions: tuple[int, ...] = (12,)
     runs: int = 20
     seed: int = 0
     tolerance: float = 1e-8
@@ -57,48 +65,92 @@ class Benchmark(Study):
     stop: bool = False
     shift: bool = False
     rotate: bool = False
+    instances: int = 0
+    targets: tuple[float, ...] = ()
 
     @property
     def cells(self) -> int:
-        """Pairs of a function and an optimizer that suits it."""
-        return len(self.pairs)
+        """Functions in their dimensions, each with every optimizer that suits it."""
+        return len(self.problems)
 
     @cached_property
     def pairs(self) -> tuple[tuple[str, Entry], ...]:
-        """Function name and optimizer of every cell."""
+        """Function name and optimizer of every cell of one dimension."""
         return tuple(
             (f, e) for f in self.functions for e in self.entries if (f, e.label) not in self.unsuited
         )
 
     @cached_property
-    def unsuited(self) -> tuple[tuple[str, str], ...]:
-        """Function name and label where the function lacks what the optimizer needs."""
-        optimizers = [(entry.label, entry.build()) for entry in self.entries]
+    def problems(self) -> tuple[tuple[str, int, Entry], ...]:
+        """Function name, dimension and optimizer of every cell, function by function."""
         return tuple(
-            (name, label)
-            for name in self.functions
-            for label, optimizer in optimizers
-            if not optimizer.suits(self.problem(name))
+            (f, D, e) for f in self.functions for D in self.dimensions for g, e in self.pairs if g == f
         )
 
-    def problem(self, name: str) -> TestFunction:
-        """Return a test function of this study."""
-        return TestFunction(name, self.dimensions, shift=self.shift, rotate=self.rotate, seed=self.seed)
+    @property
+    def goals(self) -> tuple[float, ...]:
+        """The targets, which are the tolerance where none is stated."""
+        return self.targets or (self.tolerance,)
+
+    @cached_property
+    def unsuited(self) -> tuple[tuple[str, str], ...]:
+        """Function name and label where the function lacks what the optimizer needs."""
+        return tuple(
+            (name, entry.label)
+            for name in self.functions
+            for entry in self.entries
+            if not entry.suits(self.problem(name, self.dimensions[0]))
+        )
+
+    def problem(self, name: str, dimensions: int, runs: Sequence[int] = (0,)) -> Problem:
+        """Return a test function of this study as the runs of these numbers have it."""
+        changes = {"shift": self.shift or self.instances > 0, "rotate": self.rotate or self.instances > 0}
+        own = [self.instance(run) for run in runs] if self.instances else [0]
+        return TestFunction(name, dimensions, seed=self.seed, instances=own, **changes)
+
+    def instance(self, run: int) -> int:
+        """Return the number of a run's place and rotation, from 1; 0 without instances."""
+        return 1 + run % self.instances if self.instances else 0
+
+    def budget(self, dimensions: int) -> int | None:  # noqa: ARG002
+        """Return the evaluations that every optimizer has in these dimensions; None when each has its own."""
+        return self.evaluations
 
     def names(self, cell: int) -> dict[str, str]:
         """Return function and optimizer of a cell; see `Study.names`."""
-        function, entry = self.pairs[cell]
+        function, _, entry = self.problems[cell]
         return {"function": function, "optimizer": entry.label}
+
+    def panel(self, cell: int) -> str:
+        """Return the function, and its dimension where there are several."""
+        function, D, _ = self.problems[cell]
+        return function if len(self.dimensions) == 1 else f"{function}, D = {D}"
 
     def execute(self, task: Task) -> list[Record]:
         """Return the records of a task's runs."""
-        name, entry = self.pairs[task.cell]
-        problem, optimizer = self.problem(name), entry.build()
-        stopping = Stopping(self.tolerance if self.stop else None, self.evaluations)
+        name, D, entry = self.problems[task.cell]
         runs = range(task.first, task.last)
+        return self.timed(task, self.problem(name, D, runs), entry, self.evaluations)
+
+    def timed(self, task: Task, problem: Problem, entry: Entry, evaluations: int | None) -> list[Record]:
+        """Return the records of a task's runs on a problem, with what they reached when."""
+        runs = range(task.first, task.last)
+        watched = Targeted(problem, len(runs), (self.tolerance, *self.goals), REDUCTIONS)
+        stopping = Stopping(self.tolerance if self.stop else None, evaluations)
         start = time.thread_time()
-        run = minimize(problem, optimizer, runs=runs, seed=self.seed, stopping=stopping)
-        return records_of(task, run, self.tolerance, time.thread_time() - start)
+        run = entry.run(watched, runs, seed=self.seed, stopping=stopping)
+        seconds = time.thread_time() - start
+        hit, hits, reductions = (
+            hits_of(watched, *part)
+            for part in ((0, 1), (1, 1 + len(self.goals)), (1 + len(self.goals), None))
+        )
+        further = zip(
+            records_of(task, run, self.tolerance, seconds), run.x.tolist(), hit, hits, reductions, strict=True
+        )
+        return [
+            replace(r, hit=h[0], point=tuple(x), hits=t, reductions=q, instance=self.instance(r.run))
+            for r, x, h, t, q in further
+        ]
 
     def suiting(self, named: Sequence[str]) -> tuple[Benchmark, list[str]]:
         """Return the study without optimizers that suit no function, and a sentence for everything left out.
@@ -114,9 +166,9 @@ class Benchmark(Study):
             lacking = [function for function, label in self.unsuited if label == entry.label]
             if not lacking:
                 continue
-            needs = " and ".join(NEEDS.get(need, need) for need in entry.build().needs)
+            wanted = " and ".join(NEEDS.get(need, need) for need in entry.needs)
             do = "does" if len(lacking) == 1 else "do"
-            sentence = f"{entry.label} needs {needs}, which {_listed(lacking)} {do} not have"
+            sentence = f"{entry.label} needs {wanted}, which {_listed(lacking)} {do} not have"
             if entry.label in named:
                 raise ConfigError(sentence)
             notes.append(f"{sentence}: left out there")
@@ -131,31 +183,39 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def statistics(study: Benchmark, records: Sequence[Record]) -> list[Row]:
-    """Return one row per cell: statistics of the cost over the runs, success rate, evaluations, seconds.
+    """Return one row per cell and target: statistics of the cost over the runs, success rate, evaluations, seconds.
 
     Definition:
-        evaluations, seconds: medians; evaluations_to_tolerance: median of the runs that reached the tolerance.
-        min, max, mean, variance, median: of the cost; a run without any finite cost counts as infinite.
+        evaluations, seconds: medians; evaluations_to_tolerance: median of the runs that reached the target.
+        ert: evaluations of all runs up to the target, or to their end, per run that reached it; None when none did.
+        success_rate: part of the runs that reached the target. instance: numbers of the instances, "0" is none.
+        min, max, mean, variance, median, quartiles: of the cost; a run without any finite cost counts as infinite.
         failures: number of runs with a numerical failure.
     """
-    by_cell = [(study.names(cell), records_of_cell(records, cell)) for cell in range(study.cells)]
-    return [{**names, **_statistics(own)} for names, own in by_cell if own]
+    instances = f"1-{min(study.instances, study.runs)}" if study.instances else "0"
+    rows: list[Row] = []
+    for cell in range(study.cells):
+        own = records_of_cell(records, cell)
+        common = {"dimension": study.problems[cell][1], "instance": instances}
+        for number, target in enumerate(study.goals) if own else ():
+            hits = [r.hits[number] if r.hits else r.hit for r in own]
+            rows.append({**study.names(cell), **_statistics(own, hits), "target": target, **common})
+    return rows
 
 
-def _statistics(records: Sequence[Record]) -> Row:
+def _statistics(records: Sequence[Record], reached: Sequence[int | None]) -> Row:
     cost = np.array([r.cost for r in records])
-    hits = [r.hit for r in records if r.hit is not None]
+    hits = [hit for hit in reached if hit is not None]
     several = len(cost) > 1 and bool(np.isfinite(cost).all())
     return {
         "runs": len(records),
         "evaluations": int(np.median([r.evaluations for r in records])),
-        "min": float(cost.min()),
-        "max": float(cost.max()),
+        **spread(cost),
         "mean": float(cost.mean()),
         "variance": float(cost.var(ddof=1)) if several else None,
-        "median": float(np.median(cost)),
         "success_rate": len(hits) / len(records),
         "evaluations_to_tolerance": int(np.median(hits)) if hits else None,
+        "ert": expected_running_time(reached, [r.evaluations for r in records]),
         "failures": sum(r.status == Status.FAILED.name.lower() for r in records),
         "seconds": float(np.median([r.seconds for r in records])),
     }
@@ -188,12 +248,104 @@ class Ranking:
 
 
 def rank(study: Benchmark, records: Sequence[Record]) -> Ranking | None:
-    """Rank the optimizers that ran on all functions by median cost; None below two of either."""
+    """Rank the optimizers that ran on all functions by median cost; None below two of either.
+
+    A function counts once for every dimension.
+    """
     labels = [e.label for e in study.entries if all(label != e.label for _, label in study.unsuited)]
-    if len(labels) < 2 or len(study.functions) < 2:
+    places = [(f, D) for f in study.functions for D in study.dimensions]
+    if len(labels) < 2 or len(places) < 2:
         return None
-    medians = {(r["function"], r["optimizer"]): r["median"] for r in statistics(study, records)}
-    return ranking(labels, np.array([[medians[f, label] for label in labels] for f in study.functions]))
+    medians = {
+        (r["function"], r["dimension"], r["optimizer"]): r["median"] for r in statistics(study, records)
+    }
+    return ranking(labels, np.array([[medians[*place, label] for label in labels] for place in places]))
+
+
+SHORT = 0.95
+"""An optimizer that was cut off below this part of the evaluations that another used had not the same budget."""
+
+CUT_OFF = ("iterations", "evaluations")
+"""How runs end that used what they were given; others had enough."""
+
+
+def unequal_budgets(study: Benchmark, records: Sequence[Record]) -> str | None:
+    """Return a sentence when the optimizers had different budgets, so that their costs say nothing of their ranks."""
+    for D in study.dimensions:
+        if study.budget(D) is not None:
+            continue
+        used: dict[str, int] = {}
+        given: dict[str, int] = {}
+        for r in records:
+            _, own, entry = study.problems[r.cell]
+            if own == D:
+                used[entry.label] = max(used.get(entry.label, 0), r.evaluations)
+                if r.status in CUT_OFF:
+                    given[entry.label] = max(given.get(entry.label, 0), r.evaluations)
+        most = max(used, key=used.__getitem__)
+        least = min(given, key=given.__getitem__, default=most)
+        if given.get(least, used[most]) < SHORT * used[most]:
+            return (
+                f"not ranked: {most} used {used[most]:,} evaluations and {least} was cut off after {given[least]:,}; "
+                f"--evaluations N gives all the same budget"
+            )
+    return None
+
+
+@dataclass(frozen=True)
+class PairDifference:
+    """Two optimizers that differ on one function: the better, the worse, and the p of Holm."""
+
+    function: str
+    dimension: int
+    better: str
+    worse: str
+    p: float
+
+
+def pairwise(study: Benchmark, records: Sequence[Record]) -> tuple[list[PairDifference], int]:
+    """Return the pairs of optimizers that differ at LEVEL on a function, and how many pairs were tested.
+
+    Wilcoxon's rank sum test of the costs of the runs, two-sided, corrected by [holm1979] for all pairs on the function.
+    """
+    from scipy.stats import mannwhitneyu
+
+    found, tested = [], 0
+    for function in study.functions:
+        for D in study.dimensions:
+            cells = [c for c, (f, d, _) in enumerate(study.problems) if (f, d) == (function, D)]
+            costs = {
+                study.names(c)["optimizer"]: [r.cost for r in records_of_cell(records, c)] for c in cells
+            }
+            pairs = list(combinations(costs, 2))
+            tested += len(pairs)
+            p = [_p_of(mannwhitneyu, costs[a], costs[b]) for a, b in pairs]
+            for (a, b), corrected in zip(pairs, holm(p), strict=True):
+                if corrected < LEVEL:
+                    better, worse = (a, b) if _ranked_below(costs[a], costs[b]) else (b, a)
+                    found.append(PairDifference(function, D, better, worse, corrected))
+    return found, tested
+
+
+def _p_of(test: Callable[..., Any], a: Sequence[float], b: Sequence[float]) -> float:
+    return 1.0 if len({*a, *b}) == 1 else float(test(a, b).pvalue)
+
+
+def _ranked_below(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Return whether the costs a come before those of b in the ranks of both together."""
+    from scipy.stats import rankdata
+
+    ranks = rankdata([*a, *b])
+    return float(ranks[: len(a)].mean()) < float(ranks[len(a) :].mean())
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Return p-values corrected for their number, step down [holm1979]; in their order, at most 1."""
+    corrected, largest = [1.0] * len(p), 0.0
+    for place, number in enumerate(sorted(range(len(p)), key=p.__getitem__)):
+        largest = max(largest, min(1.0, (len(p) - place) * p[number]))
+        corrected[number] = largest
+    return corrected
 
 
 def ranking(labels: Sequence[str], medians: Float) -> Ranking:

@@ -15,7 +15,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.problem import Loetters, pack, unpack
-from accelcal_cli.optimization.minimize import Run, Stopping, minimize, polish
+from accelcal_cli.optimization.minimize import Run, Stopping, polish
 from accelcal_cli.sensor.model import to_gauge
 from accelcal_cli.studies.scenarios import (
     ERRORS,
@@ -36,6 +36,7 @@ from accelcal_cli.studies.study import (
     Task,
     records_of,
     records_of_cell,
+    spread,
 )
 
 
@@ -51,6 +52,7 @@ class Comparison(Study):
         tolerance: a run succeeds when its cost is at most this above the least cost, (m/s^2)^4, or within 1 % of it.
         stop: whether a run ends when its cost is at or below the tolerance.
         polish: whether Levenberg-Marquardt finishes every search.
+        evaluations: budget per run; None leaves it to the iterations.
     """
 
     source: Simulation | Recording
@@ -61,6 +63,7 @@ class Comparison(Study):
     tolerance: float = 1e-10
     stop: bool = False
     polish: bool = False
+    evaluations: int | None = None
 
     @property
     def cells(self) -> int:
@@ -94,14 +97,12 @@ class Comparison(Study):
         """Return the records of a task's runs."""
         runs = range(task.first, task.last)
         with np.errstate(all="ignore"):
-            block, optimizer = self.calibrations(runs), self.entries[task.cell].build()
-            box = block.problem.box
-            start = self.space.starting_points(box, optimizer.population, runs, self.seed)
+            block, entry = self.calibrations(runs), self.entries[task.cell]
+            population = 1 if entry.peer else entry.build().population
+            start = self.space.starting_points(block.problem.box, population, runs, self.seed)
             begin = time.thread_time()
-            stopping = Stopping(self.tolerance if self.stop else None)
-            run = minimize(
-                block.problem, optimizer, runs=runs, seed=self.seed, stopping=stopping, start=start
-            )
+            stopping = Stopping(self.tolerance if self.stop else None, self.evaluations)
+            run = entry.run(block.problem, runs, seed=self.seed, stopping=stopping, start=start)
             if self.polish:
                 run = _polish(block.problem, run)
             seconds = time.thread_time() - begin
@@ -191,9 +192,20 @@ def _statistics(study: Comparison, own: Sequence[Record], only_successful: bool)
         "evaluations": int(np.median(evaluations)) if evaluations else None,
         "evaluations_to_success": int(np.median(hits)) if hits else None,
         "cost": _median([r.cost for r in counted]),
+        **_spread([r.cost for r in counted]),
         "excess": _median([_excess(r) for r in counted]) if study.noisy else None,
         **{name: _total(counted, name) for name in (*ERRORS, "efficiency")},
     }
+
+
+def _spread(costs: Sequence[float]) -> Row:
+    """Return least, quartiles and largest of the costs; the median is the column `cost`."""
+    row = (
+        spread(np.array(costs))
+        if costs
+        else dict.fromkeys(("min", "lower_quartile", "upper_quartile", "max"))
+    )
+    return {name: value for name, value in row.items() if name != "median"}
 
 
 def _excess(record: Record) -> float:
@@ -232,22 +244,26 @@ Estimates = Mapping[str, tuple[Float, Float]]
 """K, shape (3, 3), and D, shape (3,), by name."""
 
 
-def estimates(study: Comparison, records: Sequence[Record], printed: Sequence[PrintedEstimate]) -> Estimates:
+def estimates(
+    study: Comparison, records: Sequence[Record], printed: Sequence[PrintedEstimate], mean: bool = False
+) -> Estimates:
     """Return the truth, the estimates of the paper, and those of the median run of each optimizer.
 
     Args:
         study: on simulated readings; records: of its runs.
         printed: what the paper prints.
+        mean: take the mean of the successful runs instead of the median run; an optimizer without any is left out.
     """
     model = study.source.sensor.model  # type: ignore[union-attr]
-    named = {"truth": (model.K, model.D)}
+    lower = study.space.unknowns < 12
+    named = {"truth": (to_gauge(model.K, "lower") if lower else model.K, model.D)}
     named |= {f"paper {p.method}": (np.array(p.K_a), np.array(p.D_a)) for p in printed}
     for cell, entry in enumerate(study.entries):
         own = sorted(records_of_cell(records, cell), key=lambda r: r.cost)
-        if own:
-            values = own[len(own) // 2].values
-            K, D = unpack(np.array([values[name] for name in study.parameters], dtype=float))
-            named[entry.label] = K, D
+        chosen = [r for r in own if succeeded(study, r)] if mean else own[len(own) // 2 :][:1]
+        if chosen:
+            theta = [[r.values[name] for name in study.parameters] for r in chosen]
+            named[entry.label] = unpack(np.mean(np.array(theta, dtype=float), axis=0))
     return named
 
 

@@ -9,13 +9,14 @@ residuals, shape (..., M), and Jacobians, shape (..., M, D), for least-squares m
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from accelcal_cli.arrays import Float
+from accelcal_cli.arrays import Float, Int
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Purpose, Streams
@@ -206,11 +207,14 @@ FUNCTIONS = {
 }
 """By name: boxes of the first four from [dpso2014] section 3.1, of the others as usual in the literature."""
 
+MIRRORED = ("modified-rosenbrock",)
+"""Functions that are another one mirrored: "all" leaves them out, so that it counts none twice."""
+
 PAPER = ("sphere", "rosenbrock", "rastrigin", "griewank")
 
 
 def select(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of known test functions; none means those of the paper, "all" means all.
+    """Return the names of known test functions; none means those of the paper, "all" all that are not MIRRORED.
 
     Raises:
         ConfigError: an unknown name.
@@ -218,7 +222,9 @@ def select(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name != "all":
             _definition(name)
-    return tuple(FUNCTIONS) if "all" in names else tuple(names) or PAPER
+    if "all" not in names:
+        return tuple(names) or PAPER
+    return tuple(name for name in FUNCTIONS if name not in MIRRORED or name in names)
 
 
 def _definition(name: str) -> Definition:
@@ -229,15 +235,31 @@ def _definition(name: str) -> Definition:
     return FUNCTIONS[name]
 
 
+def rotations(normal: Float) -> Float:
+    """Return rotations of D coordinates, uniform over SO(D) (Haar), shape (K, D, D), from N(0, 1) numbers alike.
+
+    Q of the QR decomposition is uniform over O(D) once R has a positive diagonal [mezzadri2007]; of a reflection one
+    column is turned round, so that the determinant is 1.
+    """
+    Q, R = np.linalg.qr(normal)
+    Q = Q * np.sign(np.einsum("kii->ki", R))[:, None, :]
+    Q[:, :, 0] *= np.linalg.det(Q).round()[:, None]
+    return np.asarray(Q)
+
+
 class TestFunction(Problem):
     """A test function over its box, with its optimum moved or its coordinates rotated if wanted.
 
     Args:
         name: key of FUNCTIONS.
         dimensions: D >= 2.
-        shift: move the optimum to a random place in the box.
-        rotate: rotate the coordinates about the optimum at random.
+        shift: move the optimum to a random place in the box, and the box of the starting points with it.
+        rotate: rotate the coordinates about the optimum at random, by a matrix uniform over all rotations.
         seed: of position and rotation.
+        instances: numbers of the places and rotations, one for all runs or one for each, shape (R,).
+
+    Attributes:
+        optimum: the minimiser, shape (D,), or with several instances (R, 1, D).
 
     Raises:
         ConfigError: no such function.
@@ -247,22 +269,45 @@ class TestFunction(Problem):
     minimum = 0.0
 
     def __init__(
-        self, name: str, dimensions: int, *, shift: bool = False, rotate: bool = False, seed: int = 0
+        self,
+        name: str,
+        dimensions: int,
+        *,
+        shift: bool = False,
+        rotate: bool = False,
+        seed: int = 0,
+        instances: Sequence[int] = (0,),
     ) -> None:
         """Draw the position of the optimum and the rotation."""
         self.name, self.definition = name, (definition := _definition(name))
         self.lower, self.upper = np.full((2, dimensions), [[float(definition.low)], [float(definition.high)]])
-        if definition.start:
-            low, high = definition.start
-            self.start = np.full(dimensions, low), np.full(dimensions, high)
-        stream = Streams(seed, [0], Purpose.SHIFT)
+        stream = Streams(seed, instances, Purpose.SHIFT)
         centre, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-        position = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions)[0, 0] - 1.0)
+        position = centre + (1.0 - MARGIN) * half * (2.0 * stream.uniform(1, dimensions) - 1.0)
+        rotation = rotations(stream.normal(dimensions, dimensions)) if rotate else None
+        if len(instances) == 1:
+            position, rotation = position[0, 0], None if rotation is None else rotation[0]
         self.optimum = position if shift else np.full(dimensions, definition.optimum)
         self._offset = self.optimum - definition.optimum if shift else None
-        self._rotation = np.linalg.qr(stream.normal(dimensions, dimensions)[0])[0] if rotate else None
-
+        self._rotation: Float | None = rotation
+        if definition.start:
+            moved = 0.0 if self._offset is None else self._offset
+            low, high = (np.full(dimensions, limit) + moved for limit in definition.start)
+            self.start = np.clip(low, self.lower, self.upper), np.clip(high, self.lower, self.upper)
         self.has_residuals = definition.residuals is not None
+
+    def take(self, index: Int) -> TestFunction:
+        """Return the function of the runs at `index`: with several instances each run has its own."""
+        part = copy.copy(self)
+        if self.optimum.ndim > 1:
+            part.optimum = self.optimum[index]
+        if self._offset is not None and self._offset.ndim > 1:
+            part._offset = self._offset[index]
+            if self.start is not None:
+                part.start = self.start[0][index], self.start[1][index]
+        if self._rotation is not None and self._rotation.ndim > 2:
+            part._rotation = self._rotation[index]
+        return part
 
     def cost(self, x: Float) -> Float:
         """Return the function, shape (R, P), at x, shape (R, P, D)."""
@@ -279,7 +324,9 @@ class TestFunction(Problem):
         if self.definition.jacobian is None:
             raise NotImplementedError(f"{self.name} is not a sum of squares")
         inner = self.definition.jacobian(self._inner(x))
-        return inner if self._rotation is None else inner @ self._rotation
+        if self._rotation is None:
+            return inner
+        return np.asarray(inner @ (self._rotation if self._rotation.ndim == 2 else self._rotation[:, None]))
 
     def _inner(self, x: Float) -> Float:
         """Return z: x in the coordinates of the formula."""

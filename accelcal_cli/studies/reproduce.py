@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,15 +16,26 @@ from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.schema import from_mapping
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.compare import Comparison, PrintedEstimate
+from accelcal_cli.studies.functions import TestFunction
 from accelcal_cli.studies.scenarios import SearchSpace, Simulation
-from accelcal_cli.studies.study import Curves, Entry, Record, Study, Task, median_curves
+from accelcal_cli.studies.study import (
+    Curves,
+    Entry,
+    Record,
+    Row,
+    Study,
+    Task,
+    median_curves,
+    records_of_cell,
+    spread,
+)
 
 STUDIES = "studies"
 
 CHECKPOINTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Parts of the evaluations at which the convergence table reads the curves."""
 
-Show = Literal["summary", "successful", "curves", "parameters"]
+Show = Literal["summary", "successful", "curves", "parameters", "mean parameters", "coordinates"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +66,9 @@ class Part:
         runs, seed, tolerance, stop: as in `Benchmark` and `Comparison`.
         show: what is printed of it.
         paper: the paper's numbers; printed: the paper's estimates by method.
+        varies, value: of a sensitivity table, what varies from part to part, and what it is in this one; the parts
+            have one title and follow each other. In a file they are one part, with `variants` for what differs.
+        ratio: two optimizers of a sensitivity table whose mean costs are compared.
     """
 
     title: str
@@ -68,6 +83,14 @@ class Part:
     show: tuple[Show, ...] = ("summary",)
     paper: PaperTable | None = None
     printed: tuple[PrintedEstimate, ...] = ()
+    varies: str = ""
+    value: str = ""
+    ratio: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Its title, and where it is a variant what varies."""
+        return f"{self.title}, {self.varies} {self.value}" if self.varies else self.title
 
     def study(self) -> Benchmark | Comparison:
         """Return the study.
@@ -78,7 +101,7 @@ class Part:
         common: dict[str, Any] = {name: getattr(self, name) for name in ("runs", "seed", "tolerance", "stop")}
         if self.functions:
             f = self.functions
-            return Benchmark(f.names, self.optimizers, f.dimensions, evaluations=f.evaluations, **common)
+            return Benchmark(f.names, self.optimizers, (f.dimensions,), evaluations=f.evaluations, **common)
         if self.simulation and self.search:
             return Comparison(self.simulation, self.search, self.optimizers, **common)
         raise ConfigError(f"{self.title}: expected functions, or simulation and search")
@@ -128,7 +151,7 @@ class Experiment(Study):
         """Return part, function and optimizer of a cell; the function of a calibration is its own word."""
         part, own = self._locate(cell)
         names = self.studies[part].names(own)
-        return {"part": self.parts[part].title, "function": names.get("function", "calibration")} | names
+        return {"part": self.parts[part].label, "function": names.get("function", "calibration")} | names
 
     def tasks(self) -> list[Task]:
         """Return the tasks of all parts."""
@@ -185,10 +208,84 @@ def load(name: str) -> Experiment:
     if name not in files:
         raise ConfigError(f'unknown study "{name}"{did_you_mean(name, files)}; known: {", ".join(files)}')
     content = load_mapping(files[name])
-    for part in content.get("parts", []):
+    content["parts"] = [variant for part in content.get("parts", []) for variant in _variants(part)]
+    for part in content["parts"]:
         if simulation := part.get("simulation"):  # by the name of a sensor, whose file takes its place
-            simulation["sensor"] = load_mapping(shipped("sensors")[simulation["sensor"]])
+            sensor = load_mapping(shipped("sensors")[simulation["sensor"]])
+            part["simulation"] = {**simulation, "sensor": sensor}
     return replace(from_mapping(Experiment, content, str(files[name])), name=name)
+
+
+def _variants(part: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a part, or one for each of its variants: their `parameters` are of all optimizers."""
+    own = {key: value for key, value in part.items() if key != "variants"}
+    if "variants" not in part:
+        return [own]
+    varied = []
+    for variant in part["variants"]:
+        more = {**variant}
+        parameters = more.pop("parameters", {})
+        optimizers = [
+            {**entry, "parameters": {**entry.get("parameters", {}), **parameters}}
+            for entry in more.pop("optimizers", own["optimizers"])
+        ]
+        nested = {
+            key: {**own[key], **more[key]} for key in ("search", "simulation", "functions") if key in more
+        }
+        varied.append({**own, "show": [], **more, **nested, "optimizers": optimizers})
+    return varied
+
+
+def sensitivity(experiment: Experiment, records: Sequence[Record]) -> Mapping[str, list[Row]]:
+    """Return the sensitivity tables by title: a row for every value of what varies, function and optimizer.
+
+    Definition:
+        success_rate: share of runs that reached the tolerance. min, quartiles, max, mean: of the cost.
+        ratio, median_ratio: log10 of the mean, or median, of the second of `Part.ratio` over that of the first.
+    """
+    tables: dict[str, list[Row]] = {}
+    for number, (part, study) in enumerate(zip(experiment.parts, experiment.studies, strict=True)):
+        if not part.varies:
+            continue
+        own = experiment.records_of(number, records)
+        rows: list[dict[str, Any]] = []
+        for cell in range(study.cells):
+            runs = records_of_cell(own, cell)
+            cost = np.array([r.cost for r in runs])
+            names = {"varies": part.value, "function": "", **study.names(cell)}
+            hits = sum(r.hit is not None for r in runs)
+            rows.append(
+                {
+                    **names,
+                    "runs": len(runs),
+                    "success_rate": hits / len(runs),
+                    **spread(cost),
+                    "mean": float(cost.mean()),
+                }
+            )
+        for key, name in (("mean", "ratio"), ("median", "median_ratio")):
+            of = {row["optimizer"]: row[key] for row in rows}
+            for row in rows:
+                compared = row["optimizer"] in part.ratio[:1]
+                row[name] = math.log10(of[part.ratio[1]] / row[key]) if compared else None
+        tables.setdefault(part.title, []).extend(rows)
+    return tables
+
+
+def coordinates(study: Benchmark, records: Sequence[Record]) -> list[Row]:
+    """Return mean and root mean square error over the runs of every coordinate of the best point, and of the cost."""
+    rows: list[Row] = []
+    for cell in range(study.cells):
+        own = records_of_cell(records, cell)
+        names = study.names(cell)
+        optimum = TestFunction(names["function"], study.problems[cell][1]).optimum
+        x, cost = np.array([r.point for r in own]), np.array([r.cost for r in own])
+        for quantity, values in (("mean", (x, cost)), ("rmse", ((x - optimum) ** 2, cost**2))):
+            found = [*values[0].mean(axis=0).tolist(), float(values[1].mean())]
+            found = [math.sqrt(v) for v in found] if quantity == "rmse" else found
+            keys = [*(f"x{i + 1}" for i in range(x.shape[1])), "cost"]
+            rows.append({**names, "quantity": quantity, **dict(zip(keys, found, strict=True))})
+    return rows
 
 
 def curves(experiment: Experiment, records: Sequence[Record], shown: bool = False) -> Curves:
@@ -202,7 +299,7 @@ def curves(experiment: Experiment, records: Sequence[Record], shown: bool = Fals
     for number, (part, study) in enumerate(zip(experiment.parts, experiment.studies, strict=True)):
         if not shown or "curves" in part.show:
             own = median_curves(study, experiment.records_of(number, records))
-            panels |= {name or part.title: panel for name, panel in own.items()}
+            panels |= {name or part.label: panel for name, panel in own.items()}
     return panels
 
 

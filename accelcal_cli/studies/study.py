@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,8 +23,16 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.config import load_mapping
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.optimization.minimize import Run
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State, shipped_parameters
+from accelcal_cli.optimization.minimize import Run, Stopping, minimize
+from accelcal_cli.optimization.optimizer import (
+    OPTIMIZERS,
+    Optimizer,
+    State,
+    preset_parameters,
+    shipped_parameters,
+)
+from accelcal_cli.optimization.problem import Problem
+from accelcal_cli.registry import import_place
 from accelcal_cli.schema import from_mapping
 
 ALL = "all"
@@ -33,6 +42,9 @@ Curves = Mapping[str, Mapping[str, tuple[Float, Float]]]
 
 Row = Mapping[str, Any]
 """A row of statistics: names and numbers by the key of their column."""
+
+NOTES = ("source", "presets")
+"""Keys of an optimizer's file that set nothing."""
 
 TRACE_POINTS = 100
 """Points of a record's convergence curve."""
@@ -48,15 +60,52 @@ class Entry:
     Attributes:
         label: its name in the tables.
         optimizer: its name; parameters: settings that differ from its defaults.
+        preset: of the optimizer, beneath the parameters; "" is none.
+        peer: whether it is of another library, or any callable that minimises as SciPy's do; see `peers`.
     """
 
     label: str = ""
     optimizer: str = ""
     parameters: dict[str, Any] = field(default_factory=dict)
+    preset: str = ""
+    peer: bool = False
 
     def build(self) -> Optimizer[State]:
         """Return the optimizer. Raises ConfigError when name or parameters are unknown."""
-        return from_mapping(OPTIMIZERS.get(self.optimizer), self.parameters, self.label)
+        more = preset_parameters(self.optimizer, self.preset) if self.preset else {}
+        # No file may hold a colon: this was stated on the command line, and a worker has to import it again.
+        find = OPTIMIZERS.imported if ":" in self.optimizer else OPTIMIZERS.get
+        return from_mapping(find(self.optimizer), {**more, **self.parameters}, self.label)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What it needs of a problem, see `Optimizer.needs`."""
+        if self.peer:
+            return ("residuals",) if self.optimizer == "scipy:least_squares" else ()
+        return self.build().needs
+
+    def suits(self, problem: Problem) -> bool:
+        """Whether a problem offers what it needs."""
+        return all(getattr(problem, f"has_{need}") for need in self.needs)
+
+    def run(
+        self,
+        problem: Problem,
+        runs: Sequence[int],
+        *,
+        seed: int,
+        stopping: Stopping,
+        start: Float | None = None,
+    ) -> Run:
+        """Return its runs on a problem: arguments as `minimize` takes them.
+
+        A peer draws its own starting points and heeds the budget alone.
+        """
+        if self.peer:
+            from accelcal_cli.studies.peers import run_peer
+
+            return run_peer(self.optimizer, problem, runs, seed, stopping.evaluations)
+        return minimize(problem, self.build(), runs=runs, seed=seed, stopping=stopping, start=start)
 
 
 @dataclass(frozen=True)
@@ -81,6 +130,8 @@ class Budget:
         Raises:
             ConfigError: a value that the optimizer does not permit.
         """
+        if entry.peer:
+            return entry
         limits = {f.name: f.metadata for f in dataclasses.fields(OPTIMIZERS.get(entry.optimizer))}
         stated = {"population": self.population, "iterations": self.iterations}
         stated = {k: v for k, v in stated.items() if v is not None and limits[k]["low"] != limits[k]["high"]}
@@ -104,7 +155,13 @@ def words(values: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(part for part in parts if part))
 
 
-def choose(names: Sequence[str], config: Path | None, default: Sequence[str], budget: Budget) -> list[Entry]:
+def choose(
+    names: Sequence[str],
+    config: Path | None,
+    default: Sequence[str],
+    budget: Budget,
+    preset: str | None = None,
+) -> list[Entry]:
     """Return the optimizers that a command line names, with their settings.
 
     Args:
@@ -112,33 +169,45 @@ def choose(names: Sequence[str], config: Path | None, default: Sequence[str], bu
         config: YAML file with optimizers and parameters.
         default: names to take when nothing is stated.
         budget: replaces the settings of all.
+        preset: of every optimizer, beneath the parameters that a file states.
 
     Raises:
-        ConfigError: an unknown name or setting, or a value out of range.
+        ConfigError: an unknown name, preset or setting, or a value out of range.
     """
-    stated = load_entries(config) if config else {}
+    stated = load_entries(config, preset) if config else {}
     chosen = list(names) or list(stated) or list(default)
     if ALL in chosen:
         others = [name for name in chosen if name != ALL]
         chosen = list(dict.fromkeys([*stated, *OPTIMIZERS.names(), *others]))
-    return [budget.limit(stated[name] if name in stated else _shipped(name, stated)) for name in chosen]
+    return [
+        budget.limit(stated[name] if name in stated else _shipped(name, stated, preset)) for name in chosen
+    ]
 
 
-def _shipped(name: str, labels: Iterable[str]) -> Entry:
-    """Return an optimizer with its shipped settings; the labels of a file are named when it is unknown."""
+def _shipped(name: str, labels: Iterable[str], preset: str | None) -> Entry:
+    """Return an optimizer with its shipped settings and a preset, or one stated as package.module:name.
+
+    When it is unknown the labels of a file are named.
+    """
+    if ":" in name:
+        found = import_place(name, "optimizer")
+        if not inspect.isclass(found) and callable(found):
+            return Entry(name, name, peer=True)
+        OPTIMIZERS.imported(name)
     try:
         OPTIMIZERS.get(name)
     except ConfigError as error:
         further = f"; labels of the file: {', '.join(labels)}" if labels else ""
         raise ConfigError(f"{error}{further}") from None
-    return Entry(name, name, shipped_parameters(name))
+    more = preset_parameters(name, preset) if preset else {}
+    return Entry(name, name, {**shipped_parameters(name), **more})
 
 
-def load_entries(path: Path) -> dict[str, Entry]:
+def load_entries(path: Path, preset: str | None = None) -> dict[str, Entry]:
     """Return the optimizers of a file by label.
 
-    The file holds `optimizers:`, a list of mappings with `optimizer` and optionally `label`, `parameters` and `source`;
-    or just one such mapping, as the shipped files do.
+    The file holds `optimizers:`, a list of mappings with `optimizer` and optionally `label`, `preset`, `parameters` and
+    `source`; or just one such mapping, as the shipped files do. A preset that is given takes the place of the file's.
 
     Raises:
         ConfigError: the file cannot be read, or holds an unknown key or name, or a label twice.
@@ -150,21 +219,27 @@ def load_entries(path: Path) -> dict[str, Entry]:
     entries: dict[str, Entry] = {}
     for number, item in enumerate(listed, 1):
         where = f"{path}: optimizers[{number}]" if "optimizers" in content else str(path)
-        entry = _entry(item, where)
+        entry = _entry(item, where, preset)
         if entry.label in entries:
             raise ConfigError(f'{where}: label "{entry.label}" is given twice')
         entries[entry.label] = entry
     return entries
 
 
-def _entry(item: Any, where: str) -> Entry:
+def _entry(item: Any, where: str, preset: str | None) -> Entry:
     if not isinstance(item, Mapping) or "optimizer" not in item:
         raise ConfigError(f'{where}: expected a mapping with the key "optimizer"')
-    entry = from_mapping(Entry, {key: value for key, value in item.items() if key != "source"}, where)
+    entry = from_mapping(Entry, {key: value for key, value in item.items() if key not in NOTES}, where)
+    if entry.peer or ":" in entry.optimizer:
+        raise ConfigError(
+            f"{where}: optimizer {entry.optimizer}: a file imports no code; state it by --optimizer or --peer"
+        )
     label = entry.label or entry.optimizer
     if "," in label or label == ALL:
         raise ConfigError(f'{where}: label "{label}": expected no comma, and not "{ALL}"')
-    parameters = {**shipped_parameters(entry.optimizer), **entry.parameters}
+    chosen = preset or entry.preset
+    more = preset_parameters(entry.optimizer, chosen) if chosen else {}
+    parameters = {**shipped_parameters(entry.optimizer), **more, **entry.parameters}
     from_mapping(OPTIMIZERS.get(entry.optimizer), parameters, where)
     return Entry(label, entry.optimizer, parameters)
 
@@ -194,6 +269,8 @@ class Record:
         values: further results of the kind of study (parameter errors, ...), by name.
         curve: points of evaluations and best cost so far, thinned; none beyond the first CURVES runs.
         seconds: time of the run: its share of the time of its block.
+        point: best point of a test function; hits: evaluations to each of its targets, or None; reductions: likewise to
+            each part of the first cost; instance: which place and rotation of the function, 0 is the plain one.
     """
 
     cell: int
@@ -206,11 +283,28 @@ class Record:
     values: dict[str, float | None]
     curve: tuple[tuple[float, ...], ...]
     seconds: float
+    point: tuple[float, ...] = ()
+    hits: tuple[int | None, ...] = ()
+    reductions: tuple[int | None, ...] = ()
+    instance: int = 0
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Record:
         """Return the record of a journal's line."""
-        return cls(**{**record, "curve": tuple(map(tuple, record["curve"]))})
+        listed = {name: tuple(record.get(name, ())) for name in ("point", "hits", "reductions")}
+        return cls(**{**record, **listed, "curve": tuple(map(tuple, record["curve"]))})
+
+
+def spread(cost: Float) -> Row:
+    """Return least, quartiles and largest of costs, shape (R,); infinite ones are quantiles as they stand."""
+    method: Any = "linear" if np.isfinite(cost).all() else "inverted_cdf"
+    values = np.quantile(cost, SPREAD, method=method)
+    return dict(
+        zip(("min", "lower_quartile", "median", "upper_quartile", "max"), map(float, values), strict=True)
+    )
+
+
+SPREAD = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def records_of_cell(records: Iterable[Record], cell: int) -> list[Record]:
@@ -239,6 +333,10 @@ class Study(ABC):
     @abstractmethod
     def names(self, cell: int) -> dict[str, str]:
         """Return what identifies a cell in the raw results, such as function and optimizer, by column."""
+
+    def panel(self, cell: int) -> str:
+        """Return what the curves of a cell belong to: its function, "" for a study without."""
+        return self.names(cell).get("function", "")
 
     @abstractmethod
     def execute(self, task: Task) -> list[Record]:
@@ -311,8 +409,10 @@ def _curve(run: Run, i: int) -> tuple[tuple[float, ...], ...]:
     return tuple((int(n), float(c)) for n, c in zip(counts, costs, strict=True) if np.isfinite(c))
 
 
-def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple[Float, Float] | None:
-    """Return the median best cost of several runs against evaluations, both of shape (points,).
+def median_curve(
+    records: Sequence[Record], points: int = TRACE_POINTS, quantile: float = 0.5
+) -> tuple[Float, Float] | None:
+    """Return the median, or another quantile, of the best cost of several runs against evaluations, shape (points,).
 
     From where all runs have a cost to the last evaluation of the longest; a run that ended keeps its cost. None
     when no run left a curve.
@@ -322,15 +422,20 @@ def median_curve(records: Sequence[Record], points: int = TRACE_POINTS) -> tuple
         return None
     grid = np.linspace(max(n[0] for n, _ in curves), max(n[-1] for n, _ in curves), points)
     rows = [cost[np.searchsorted(n, grid, side="right") - 1] for n, cost in curves]
-    return grid, np.median(rows, axis=0)
+    return grid, np.median(rows, axis=0) if quantile == 0.5 else np.quantile(rows, quantile, axis=0)
 
 
 def median_curves(study: Study, records: Sequence[Record]) -> Curves:
     """Return the median curve of each cell that left one, by function ("" for a study without) and optimizer."""
+    return quantile_curves(study, records, 0.5)
+
+
+def quantile_curves(study: Study, records: Sequence[Record], quantile: float) -> Curves:
+    """Return as `median_curves` does a quantile of the best costs."""
     panels: dict[str, dict[str, tuple[Float, Float]]] = {}
     for cell in range(study.cells):
-        names, curve = study.names(cell), median_curve(records_of_cell(records, cell))
-        panel = panels.setdefault(names.get("function", ""), {})
+        curve = median_curve(records_of_cell(records, cell), quantile=quantile)
+        panel = panels.setdefault(study.panel(cell), {})
         if curve is not None:
-            panel[names["optimizer"]] = curve
+            panel[study.names(cell)["optimizer"]] = curve
     return panels

@@ -14,7 +14,7 @@ from accelcal_cli.calibration.observability import (
     UNDETERMINED,
     WEAK,
 )
-from accelcal_cli.calibration.result import Calibration, Temperature
+from accelcal_cli.calibration.result import Calibration, Temperature, Worn
 from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.poses import AXES
 from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Convergence, Table, notes
@@ -42,9 +42,10 @@ def tables(result: Calibration) -> list[Table]:
 
 
 def parameter_tables(result: Calibration) -> list[Table]:
-    """Return the parameters in the paper's units, in an engineer's, and against temperature where it matters."""
+    """Return the parameters in the paper's units, in an engineer's, against temperature, and what GGIR says of wear."""
     slopes = [] if result.temperature is None else [temperature(result, result.temperature)]
-    return [parameters(result), engineering(result), *slopes]
+    of_wear = [] if result.worn is None else [worn(result.worn)]
+    return [parameters(result), engineering(result), *slopes, *of_wear]
 
 
 def blocks(result: Calibration) -> list[Block]:
@@ -174,6 +175,30 @@ def temperature(result: Calibration, slopes: Temperature) -> Table:
         f"{slopes.high:.4g}."
     )
     return Table("Temperature", columns, tuple(rows), (note,))
+
+
+def worn(figures: Worn) -> Table:
+    """Return what GGIR says of a calibration with days of wear."""
+    rows = (
+        (
+            "mean error before",
+            f"{figures.error_before:.4g}" if np.isfinite(figures.error_before) else "-",
+            "mg",
+        ),
+        ("mean error after", f"{figures.error_after:.4g}", "mg"),
+        ("points, windows of 10 s at rest", f"{figures.windows:,}", ""),
+        ("sphere filled within +-0.3 g", "yes" if figures.filled else "no", ""),
+        *(
+            (f"rest along {axis}", f"{low:.2f} to {high:.2f}", "g")
+            for axis, low, high in zip(AXES, figures.low, figures.high, strict=True)
+        ),
+        ("hours recorded", f"{figures.hours:.4g}", "h"),
+        ("hours at rest", f"{figures.rest_hours:.4g}", "h"),
+    )
+    note = "Error: mean of | |a| - 1 g | over the windows. GGIR asks for a filled sphere and less than 10 mg after."
+    return Table(
+        "Days of wear", (Column("quantity"), Column("value"), Column("unit", beside=True)), rows, (note,)
+    )
 
 
 def fit(result: Calibration) -> Table:

@@ -28,7 +28,14 @@ COMPARISON = (
     Column("scale error", "ppm", ".3g", key="scale_error"),
     Column("misalignment", "arcsec", ".3g", key="misalignment_error"),
     Column("efficiency", format=".3g"),
+    Column("min", format=".3g"),
+    Column("lower quartile", format=".3g", key="lower_quartile"),
+    Column("upper quartile", format=".3g", key="upper_quartile"),
+    Column("max", format=".3g"),
 )
+
+SPREAD = ("optimizer", "min", "lower_quartile", "cost", "upper_quartile", "max")
+"""Columns of the table of the costs' spread, which people see beside the rest of a comparison."""
 
 
 ERROR_PARTS = (
@@ -50,6 +57,12 @@ ERROR_PARTS_NOTE = (
 
 PARAMETERS = ("K_11", "K_12", "K_13", "K_21", "K_22", "K_23", "K_31", "K_32", "K_33", "D_1", "D_2", "D_3")
 
+
+FUNCTION_COLUMNS = (
+    "function", "optimizer", "min", "lower_quartile", "median", "upper_quartile", "max", "mean", "variance",
+    "success_rate", "evaluations_to_tolerance", "ert", "runs", "evaluations", "failures", "seconds",
+)  # fmt: skip
+"""Columns of a paper's test functions, in order."""
 
 KEYS = ("function", "optimizer")
 """Columns that identify the row of ours to which a row of the paper belongs."""
@@ -100,12 +113,25 @@ def _misses(rows: Sequence[Row]) -> list[str]:
     return sentences
 
 
+def split_spread(table: Table) -> tuple[Table, Table]:
+    """Return a comparison without the spread of the costs, and their spread: least, quartiles and largest."""
+    keys = [column.label for column in table.columns]
+    rest = table.with_columns(i for i, key in enumerate(keys) if key == "cost" or key not in SPREAD[1:])
+    own = table.with_columns(i for i, key in enumerate(keys) if key in SPREAD)
+    order = sorted(range(len(own.columns)), key=lambda i: SPREAD.index(own.columns[i].label))
+    named = own.with_columns(order)
+    median = tuple(replace(c, name="median", unit="") if c.label == "cost" else c for c in named.columns)
+    return rest, replace(named, title="Cost over the runs", columns=median, notes=())
+
+
 def parameter_table(estimates: Estimates) -> Table:
     """Return every parameter of every estimate."""
     columns = (Column("parameter"), *(Column(name, format=".8g") for name in estimates))
     rows = []
     for name in PARAMETERS:
         index = tuple(int(digit) - 1 for digit in name[2:])
+        if name[0] == "K" and all(K[index] == 0 for K, _ in estimates.values()):
+            continue  # of gauge lower
         rows.append((name, *(float((K if name[0] == "K" else D)[index]) for K, D in estimates.values())))
     return Table("estimates", columns, tuple(rows))
 
@@ -125,10 +151,49 @@ def experiment_catalogue() -> Table:
 def experiment_tables(experiment: Experiment, records: Sequence[Record]) -> list[Table]:
     """Return what is to be printed of an experiment's records, part by part."""
     return [
-        replace(table, title=f"{part.title}: {table.title}" if table.title else part.title).filled()
-        for number, part in enumerate(experiment.parts)
-        for table in _part_tables(part, experiment.records_of(number, records))
+        *(
+            replace(table, title=f"{part.title}: {table.title}" if table.title else part.title).filled()
+            for number, part in enumerate(experiment.parts)
+            for table in _part_tables(part, experiment.records_of(number, records))
+        ),
+        *_sensitivity_tables(experiment, records),
     ]
+
+
+SENSITIVITY = (
+    Column("function"),
+    Column("optimizer"),
+    Column("runs", format=",d"),
+    Column("success", format=".0%", key="success_rate"),
+    *(Column(name, format=".2g") for name in ("min",)),
+    Column("lower quartile", format=".2g", key="lower_quartile"),
+    Column("median", format=".2g"),
+    Column("upper quartile", format=".2g", key="upper_quartile"),
+    Column("max", format=".2g"),
+    Column("mean", format=".2g"),
+    Column("log10 ratio of means", format=".1f", key="ratio"),
+    Column("of medians", format=".1f", key="median_ratio"),
+)
+
+
+def _sensitivity_tables(experiment: Experiment, records: Sequence[Record]) -> list[Table]:
+    """Return one table for each thing that varies, its values in the first column."""
+    tables = []
+    for title, rows in reproduce.sensitivity(experiment, records).items():
+        part = next(part for part in experiment.parts if part.title == title)
+        columns = (Column(part.varies, key="varies"), *SENSITIVITY)
+        notes = [f"Log10 ratio: cost of {part.ratio[1]} over that of {part.ratio[0]}."] if part.ratio else []
+        tables.append(table_of(title, columns, rows, notes).filled())
+    return tables
+
+
+def _coordinate_table(study: Benchmark, records: Sequence[Record]) -> Table:
+    rows = reproduce.coordinates(study, records)
+    columns = (
+        *(Column(name) for name in (*KEYS, "quantity")),
+        *(Column(key, format=".3g") for key in list(rows[0])[3:]),
+    )
+    return table_of("best points over the runs", columns, rows)
 
 
 def _part_tables(part: Part, records: Sequence[Record]) -> list[Table]:
@@ -141,15 +206,27 @@ def _part_tables(part: Part, records: Sequence[Record]) -> list[Table]:
                 if isinstance(study, Benchmark)
                 else comparison_table(study, records)
             )
-            tables.append(with_paper_rows(replace(ours, title=""), part.paper))
+            further = []
+            if isinstance(study, Benchmark):
+                keys = [column.label for column in ours.columns]
+                ours = ours.with_columns(keys.index(key) for key in FUNCTION_COLUMNS)
+            if isinstance(study, Comparison):
+                ours, costs = split_spread(ours)
+                further = [costs]
+            tables += [with_paper_rows(replace(ours, title=""), part.paper), *further]
         elif show == "curves":
             tables.append(checkpoint_table(median_curves(study, records)))
         elif show == "successful" and isinstance(study, Comparison):
             rows = compare.statistics(study, records, only_successful=True)
-            tables.append(table_of("successful runs alone", COMPARISON, rows))
-        elif show == "parameters" and isinstance(study, Comparison):
-            estimates = compare.estimates(study, records, part.printed)
-            tables += [parameter_table(estimates), error_parts_table(study, estimates)]
+            tables.append(split_spread(table_of("successful runs alone", COMPARISON, rows))[0])
+        elif show == "coordinates" and isinstance(study, Benchmark):
+            tables.append(_coordinate_table(study, records))
+        elif show in ("parameters", "mean parameters") and isinstance(study, Comparison):
+            mean = show == "mean parameters"
+            estimates = compare.estimates(study, records, part.printed, mean=mean)
+            whose = "mean of the successful runs" if mean else "median run"
+            own = [parameter_table(estimates), error_parts_table(study, estimates)]
+            tables += [replace(table, title=f"{table.title}, {whose}") for table in own]
     return tables
 
 

@@ -7,7 +7,8 @@ import typing
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, shipped_parameters
+from accelcal_cli.config import load_mapping
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, optimizer_file, shipped_parameters
 from accelcal_cli.studies.benchmark import LEVEL, Benchmark, Ranking, statistics
 from accelcal_cli.studies.study import Curves, Record, Row, Study
 from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table, convergence
@@ -28,6 +29,7 @@ def raw_table(study: Study, records: Sequence[Record]) -> Table:
     Costs and values that are not finite are left for the writer to leave empty.
     """
     further = list(dict.fromkeys(name for record in records for name in record.values))
+    own = study if isinstance(study, Benchmark) else None
     columns = (
         *(Column(label) for label in study.names(0)),
         Column("run", format="d"),
@@ -37,16 +39,36 @@ def raw_table(study: Study, records: Sequence[Record]) -> Table:
         Column("status"),
         Column("hit", format="d"),
         *(Column(name, format=".6g") for name in further),
+        *(_points_of(own) if own else ()),
     )
     rows = [
         (
             *study.names(r.cell).values(),
             *(r.run, r.cost, r.evaluations, r.iterations, r.status, r.hit),
             *(r.values.get(name) for name in further),
+            *(_run_of(own, r) if own else ()),
         )
         for r in records
     ]
     return Table("Raw results", columns, tuple(rows))
+
+
+def _points_of(study: Benchmark) -> list[Column]:
+    """Return the columns of runs on test functions: where, hits of the targets, trace and best point."""
+    counts = ["dimension", "instance", *(f"hit_{target:g}" for target in study.targets)]
+    return [
+        *(Column(name, format="d") for name in counts),
+        *(Column("trace_evaluations"), Column("trace_cost")),
+        *(Column(f"x_{i + 1}", format=".6g") for i in range(max(study.dimensions))),
+    ]
+
+
+def _run_of(study: Benchmark, r: Record) -> list[Any]:
+    """Return the cells of `_points_of` of one run: a trace is numbers with spaces between."""
+    D = study.problems[r.cell][1]
+    trace = [" ".join(map(str, column)) for column in zip(*r.curve, strict=True)] or ["", ""]
+    point = [*r.point, *[None] * (max(study.dimensions) - len(r.point))]
+    return [D, r.instance, *(r.hits if study.targets else ()), *trace, *point]
 
 
 BENCHMARK = (
@@ -63,14 +85,33 @@ BENCHMARK = (
     Column("to tolerance", format=",d", key="evaluations_to_tolerance"),
     Column("failed", format="d", key="failures"),
     Column("time", "s", ".3f", key="seconds"),
+    Column("lower quartile", format=".3g", key="lower_quartile"),
+    Column("upper quartile", format=".3g", key="upper_quartile"),
+    Column("ERT", format=",.0f", key="ert"),
+    Column("target", format="g"),
+    Column("D", format="d", key="dimension"),
+    Column("instance"),
 )
+
+SHOWN = (
+    "optimizer", "evaluations", "min", "lower_quartile", "median", "upper_quartile", "max", "mean", "success_rate",
+    "evaluations_to_tolerance", "ert", "failures", "seconds",
+)  # fmt: skip
+"""Columns that people see of each function, in order; the others are for programs."""
 
 
 def benchmark_title(study: Benchmark) -> str:
     """Return what a benchmark runs, in one line."""
     runs = "1 run" if study.runs == 1 else f"{study.runs:,} runs"
     changes = ", shifted" * study.shift + ", rotated" * study.rotate
-    return f"Benchmark: D = {study.dimensions}, {runs}, tolerance {study.tolerance:g}, seed {study.seed}{changes}"
+    if study.instances:
+        changes = f", {study.instances} instances"
+    budgets = [budget for D in study.dimensions if (budget := study.budget(D)) is not None]
+    if budgets:
+        counts = " and ".join(dict.fromkeys(f"{budget:,}" for budget in budgets))
+        changes += f", {counts} evaluations (the last generation is finished)"
+    sizes = ", ".join(map(str, study.dimensions))
+    return f"Benchmark: D = {sizes}, {runs}, tolerance {study.tolerance:g}, seed {study.seed}{changes}"
 
 
 def benchmark_table(study: Benchmark, records: Sequence[Record]) -> Table:
@@ -126,7 +167,7 @@ BELOW = 1e-4
 
 
 def benchmark_blocks(
-    title: str, summary: Table, curves: Curves, tolerance: float, further: Iterable[Table]
+    title: str, summary: Table, curves: Curves, tolerance: float, further: Iterable[Block]
 ) -> list[Block]:
     """Return what a benchmark shows: table and curves of each function, then tables of all.
 
@@ -139,20 +180,31 @@ def benchmark_blocks(
     """
     blocks: list[Block] = [Paragraph(heading=title), BLANK]
     for function, panel in curves.items():
-        blocks.append(_of_function(summary, function))
+        blocks.append(_of_panel(summary, function))
         if panel:
             blocks.append(convergence(function, panel, tolerance * BELOW))
     return [*blocks, *further]
 
 
-def _of_function(summary: Table, function: str) -> Table:
-    """Return the rows of one function, without what the heading says, nor failures where there are none."""
+def shown_columns(summary: Table) -> Table:
+    """Return the rows of a benchmark with the columns that people see, and function, dimension and target."""
     keys = [column.label for column in summary.columns]
-    rows = tuple(row for row in summary.rows if row[0] == function)
+    wanted = ("function", "dimension", *SHOWN[:-2], "target")
+    return summary.with_columns(keys.index(key) for key in wanted)
+
+
+def _of_panel(summary: Table, function: str) -> Table:
+    """Return the rows of one function and dimension, without what the heading says, nor failures where there are none.
+
+    Of several targets the first has a row here; `target_table` has all.
+    """
+    keys = [column.label for column in summary.columns]
+    name, target = (keys.index(key) for key in ("dimension", "target"))
+    own = [row for row in summary.rows if function in (row[0], f"{row[0]}, D = {row[name]}")]
+    rows = tuple(row for row in own if row[target] == own[0][target])
     failed = any(row[keys.index("failures")] for row in rows)
-    hidden = ("function", "runs") if failed else ("function", "runs", "failures")
-    table = Table(function, summary.columns, rows)
-    return table.with_columns(i for i, key in enumerate(keys) if key not in hidden)
+    shown = [key for key in SHOWN if key != "failures" or failed]
+    return Table(function, summary.columns, rows).with_columns(keys.index(key) for key in shown)
 
 
 def _parameters(name: str) -> dict[str, Any]:
@@ -191,7 +243,17 @@ def optimizer_settings(name: str) -> Table:
     ]
     columns = (Column("parameter"), Column("default"), Column("range"), Column("meaning"))
     title = f"{name}: {cls.family}, [{cls.paper}]. {_sentence(cls)}"
-    return Table(title, columns, tuple(rows))
+    return Table(title, columns, tuple(rows), tuple(_presets(name)))
+
+
+def _presets(name: str) -> list[str]:
+    """Return a sentence for each preset of an optimizer: what it sets; none where the file has none."""
+    path = optimizer_file(name)
+    presets = load_mapping(path).get("presets", {}) if path else {}
+    return [
+        f"--preset {key}: {assignments(values) if values else 'the defaults'}"
+        for key, values in presets.items()
+    ]
 
 
 def _sentence(cls: type) -> str:
@@ -229,7 +291,7 @@ def optimizer_settings_blocks(table: Table) -> list[Block]:
     for name, default, values, meaning in table.rows:
         limits = f"  ({values})" if values else ""
         blocks += [Paragraph(f" = {plain(default)}{limits}", heading=name), Paragraph(meaning, indent=2)]
-    return blocks
+    return [*blocks, *([BLANK] if table.notes else []), *map(Paragraph, table.notes)]
 
 
 def assignments(parameters: Mapping[str, Any]) -> str:

@@ -10,11 +10,12 @@ import pytest
 import typer.main
 
 from accelcal_cli.calibration import settings
-from accelcal_cli.cli import benchmark, calibrate, compare, navigate, options
+from accelcal_cli.cli import benchmark, calibrate, compare, navigate, options, running
 from accelcal_cli.cli.main import NAMES, app, expand, help_text
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.navigation.gravity_map import PRESETS
 from accelcal_cli.navigation.particle_filter import FILTERS
+from accelcal_cli.optimization import optimizer
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.planning import FIXTURES
 from accelcal_cli.sensor.model import Gauge
@@ -31,6 +32,7 @@ def test_the_choices_are_those_of_the_library():
     assert typing.get_args(settings.Attitudes) == calibrate.ATTITUDES
     assert set(SCHEMES) == set(options.SCHEMES)
     assert FIXTURES == options.FIXTURES
+    assert optimizer.PRESETS == calibrate.PRESETS == running.PRESETS
     assert tuple(FUNCTIONS) == benchmark.FUNCTIONS
     assert {*PRESETS} == {*navigate.MAPS}
     assert set(compare.UNKNOWNS) <= set(options.GAUGES)

@@ -111,7 +111,7 @@ class Undocumented(Bad):
 class OtherMeaning(Bad):
     """A format."""
 
-    instance: int = setting(0, "times it is written")
+    instance: int | None = setting(None, "times it is written")
 
 
 class Changing(Bad):

@@ -6,12 +6,13 @@ import dataclasses
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
+import numpy as np
 import optimizer_contract as contract
 import pytest
 
 from accelcal_cli.config import load_mapping
 from accelcal_cli.optimization.minimize import minimize
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, State, optimizer_file
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, PRESETS, State, optimizer_file, preset_parameters
 from accelcal_cli.schema import from_mapping
 
 NAMES = OPTIMIZERS.names()
@@ -132,7 +133,68 @@ def test_every_optimizer_ships_its_settings(name):
         value = getattr(built, key)
         assert (list(value) if isinstance(value, tuple) else value) == stated
     assert built == cls() or not OPTIMIZERS.is_built_in(cls)
-    assert set(record) == {"optimizer", "source", "parameters"}
+    assert set(record) - {"presets"} == {"optimizer", "source", "parameters"}
+
+
+BUILT_IN = [name for name in NAMES if OPTIMIZERS.is_built_in(OPTIMIZERS.get(name))]
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_optimizer_ships_both_presets(name):
+    """What they state differs from the default, and one of them is the default where there is no third."""
+    cls = OPTIMIZERS.get(name)
+    stated = {preset: preset_parameters(name, preset) for preset in PRESETS}
+    assert list(load_mapping(optimizer_file(name))["presets"]) == list(PRESETS)
+    for preset, parameters in stated.items():
+        from_mapping(cls, parameters, f"{name}: {preset}")
+        default = {key: getattr(cls(), key) for key in parameters}
+        same = [
+            key
+            for key, value in from_mapping(cls, parameters, name).__dict__.items()
+            if key in parameters and value == default[key]
+        ]
+        assert same == [], f"{preset} states the default of {same}"
+    assert stated["printed"] != stated["tuned"] or not stated["printed"]
+
+
+VARIANTS = [
+    ("pso", {"randoms": "particle"}),
+    ("pso", {"randoms": "particle", "draws": 2}),
+    ("de-pso", {"randoms": "particle"}),
+    ("kpso", {"randoms": "coordinate"}),
+    ("akpso", {"randoms": "particle"}),
+    ("akpso", {"kalman_dim": 4}),
+    ("akpso", {"kalman_dim": 4, "observation": "step"}),
+    ("akpso", {"kalman_dim": 2, "observation": "step"}),
+    ("akpso", {"kalman_dim": 4, "first_state": "zero"}),
+    ("akpso", {"position": "sampled"}),
+    ("akpso", {"memory": "adaptive"}),
+    ("akpso", {"kalman_dim": 4, "bests": "filtered", "first_state": "zero"}),
+    ("foa", {"start": "plane"}),
+    ("foa", {"outside": "swarm"}),
+    ("ifoa", {"rounding": "round"}),
+    ("ifoa", {"rounding": "ceil"}),
+    ("ifoa", {"rounding": "1+floor"}),
+    ("shade-cma", {"smallest": 4, "greed": 0.11, "archive": 2.6, "samples": 11}),
+]
+"""Every other reading of a paper: settings that the contract, which builds the defaults, does not see."""
+
+
+@pytest.mark.parametrize(("name", "reading"), VARIANTS, ids=str)
+def test_every_reading_keeps_the_box_counts_and_repeats(name, reading):
+    """It differs from the default, stays in the box, and run 3 alone has the bits of run 3 in a batch."""
+    cls, case = OPTIMIZERS.get(name), contract.CASES["sphere"]
+    default = contract.short(cls)
+    changed = dataclasses.replace(default, **reading)
+    problem = contract.watched(case.make())
+    batch = minimize(problem, changed, runs=5, seed=9)
+    points = problem.seen.all()
+    assert ((points >= problem.lower) & (points <= problem.upper)).all()
+    assert problem.seen.evaluations == batch.evaluations.sum()
+    assert (np.diff(batch.trace, axis=1) <= 0).all()
+    assert (batch.trace[:, -1] < batch.trace[:, 0]).any()
+    contract.same_run(minimize(case.make(), changed, runs=[3], seed=9), 0, batch, 3)
+    assert not np.array_equal(batch.trace[:, -1], minimize(case.make(), default, runs=5, seed=9).trace[:, -1])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,4 +1,4 @@
-"""A package of somebody else adds an optimizer and an exporter, with no file of this project edited.
+"""A package of somebody else adds an optimizer, an exporter and a log format, with no file of this project edited.
 
 `plugin/` is built and installed beside the project, as pip would, and found by its entry points alone.
 """
@@ -12,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 HERE = Path(__file__).parent
@@ -123,6 +124,21 @@ def test_the_exporter_is_in_the_help_and_writes_its_file(site, tmp_path):
 
 def test_the_exporter_keeps_the_contract(site):
     done = contract(site, "test_the_contract and text", "exporters")
+    assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
+
+
+def test_the_log_format_is_found_by_content_and_keeps_the_contract(site, tmp_path):
+    force = np.vstack([np.eye(3), -np.eye(3), np.full((2, 3), [[0.6], [-0.6]])]) * 9.81
+    rows = np.column_stack([np.arange(8.0), 1.01 * force + 0.1])
+    (tmp_path / "log").write_bytes(b"WOLF\0\0\0\0" + rows.astype("<f8").tobytes())
+    code = (
+        "import sys\nfrom accelcal_cli.io.reader import open_table, Selection\n"
+        "table = open_table(sys.argv[1])\n"
+        "print(table.source_format, sum(len(b.numbers) for b in table.blocks(Selection((1, 2, 3)))))"
+    )
+    done = call(site, "-c", code, str(tmp_path / "log"))
+    assert done.stdout.split() == ["wolf", "8"], done.stderr
+    done = contract(site, "says_what_it_is and wolf", "log_formats")
     assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
 
 

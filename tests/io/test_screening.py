@@ -151,6 +151,25 @@ def test_traps_are_named(trap, capsys):
     assert named >= 0.9 * sets
 
 
+def test_noise_within_that_of_a_row_is_no_gravity():
+    """Means of a few poses may lie on a sphere by chance, but not within the noise of their rows."""
+    rng, sphere = np.random.default_rng(4), directions(12, "edges", np.empty((0, 3)))
+    scatter = np.full((12, 3), 0.02)
+    for _ in range(20):
+        means = rng.normal(0, 0.02 / np.sqrt(20), (12, 3))
+        assert keys(means, count=np.full(12, 20.0), scatter=scatter, single=False) == {"gravity-removed"}
+        sound = 9.8 * sphere + means
+        assert not keys(sound, count=np.full(12, 20.0), scatter=scatter, single=False)
+
+
+def test_a_few_steps_about_zero_are_no_gravity():
+    rng = np.random.default_rng(5)
+    rows = np.rint(rng.normal(0, 0.7, (40, 3)))
+    rows = rows[rows.any(axis=1)]
+    assert "gravity-removed" in keys(rows, zeros=True)
+    assert "gravity-removed" not in keys(np.vstack([np.eye(3), -np.eye(3)]))  # six faces, in whole g
+
+
 @pytest.mark.parametrize("poses", [12, 24, 200])
 def test_readings_without_gravity_are_named(poses):
     rng = np.random.default_rng(14)

@@ -114,7 +114,7 @@ def test_raw_results_have_a_row_for_every_run(run, tmp_path, name):
     assert done.code == 0
     read = polars.read_csv if name.endswith(".csv") else polars.read_parquet
     frame = read(tmp_path / name)
-    assert frame.shape == (16, 8)
+    assert frame.shape == (16, 15)
     assert frame["run"].to_list() == [0, 1, 2, 3] * 4
     assert {path.name for path in tmp_path.iterdir()} == {name}
 

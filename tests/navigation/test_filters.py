@@ -172,10 +172,22 @@ def test_de_mc_leaves_a_gaussian_as_it_is():
 # Filters
 
 
+WALKING = ("apo-pf", "pf", "pso-pf")
+"""Filters whose position is a random walk: they hold errors like the paper's, and no velocity of a metre a second."""
+
+
 @pytest.fixture(scope="module")
-def results(voyage):
+def scenarios(voyage, rough):
+    plan = PlannedVoyage(drift=(1000.0, 1700.0))
+    drifting = simulate(rough, plan, InsGrade(), runs=range(6), seed=1, period=30.0, prior="tied")
+    return {name: drifting if name in WALKING else voyage for name in NAMES}
+
+
+@pytest.fixture(scope="module")
+def results(scenarios):
     return {
-        name: run(voyage, name, generations=5) if name in EVOLVING else run(voyage, name) for name in NAMES
+        name: run(scenarios[name], name, generations=5) if name in EVOLVING else run(scenarios[name], name)
+        for name in NAMES
     }
 
 

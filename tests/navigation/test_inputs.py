@@ -533,7 +533,9 @@ def test_a_bad_key_of_the_file_is_one_message(tmp_path, text, told):
 def test_two_measurements_are_enough_for_every_filter(tmp_path):
     path = tmp_path / "study.yaml"
     path.write_text("plan: {hours: 2.0028}\nruns: 1\nnoise: 1.0e-3\n")
-    assert len(json.loads(navigate("--config", path, "--format", "json", "-q"))) == len(FILTERS.names())
+    assert len(json.loads(navigate("--config", path, "--filter", "all", "--format", "json", "-q"))) == len(
+        FILTERS.names()
+    )
 
 
 def test_a_voyage_of_one_measurement_is_refused(tmp_path):

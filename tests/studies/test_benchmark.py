@@ -18,13 +18,13 @@ from accelcal_cli.views.studies import ranking_table, raw_table
 SMALL = {"population": 20, "iterations": 30}
 CONTRACT = {
     "function", "optimizer", "runs", "evaluations", "min", "max", "mean", "variance", "median", "success_rate",
-    "seconds",
+    "seconds", "ert", "target", "dimension", "instance",
 }  # fmt: skip
 
 
 def study(functions=("sphere", "rosenbrock"), optimizers=("pso", "de"), **changes):
     budget = Budget(**SMALL)
-    changes = {"dimensions": 3, "runs": 7, "tolerance": 1e-2, **changes}
+    changes = {"dimensions": (3,), "runs": 7, "tolerance": 1e-2, **changes}
     return Benchmark(tuple(functions), tuple(choose(optimizers, None, (), budget)), **changes)
 
 
@@ -88,7 +88,10 @@ def test_a_run_without_a_cost_is_infinite_and_a_failure():
 def test_raw_rows_do_not_tell_how_long_it_took(done):
     table = raw_table(*done)
     names = [column.name for column in table.columns]
-    assert names == ["function", "optimizer", "run", "cost", "evaluations", "iterations", "status", "hit"]
+    assert names == [
+        *("function", "optimizer", "run", "cost", "evaluations", "iterations", "status", "hit"),
+        *("dimension", "instance", "trace_evaluations", "trace_cost", "x_1", "x_2", "x_3"),
+    ]
     assert [row[2] for row in table.rows] == list(range(7)) * 4
 
 
@@ -119,7 +122,7 @@ def test_curves_are_named_and_fall(done):
 
 def test_least_squares_takes_part_where_there_are_squares():
     everyone = choose(["all"], None, (), Budget(population=20, evaluations=600))
-    mixed = Benchmark(("sphere", "rastrigin"), tuple(everyone), dimensions=3)
+    mixed = Benchmark(("sphere", "rastrigin"), tuple(everyone), dimensions=(3,))
     assert ("sphere", "levenberg-marquardt") in [(f, e.label) for f, e in mixed.pairs]
     assert ("rastrigin", "levenberg-marquardt") in mixed.unsuited
     left, notes = mixed.suiting([])
@@ -131,7 +134,7 @@ def test_least_squares_takes_part_where_there_are_squares():
 
 def test_levenberg_marquardt_solves_sums_of_squares():
     small = Benchmark(("sphere", "zakharov", "elliptic"), tuple(choose(["levenberg-marquardt"], None, (), Budget())),
-                      dimensions=4, runs=3, shift=True, rotate=True)  # fmt: skip
+                      dimensions=(4,), runs=3, shift=True, rotate=True)  # fmt: skip
     assert all(r.cost < 1e-12 for r in run_study(small, Journal(None)))
 
 
@@ -141,7 +144,7 @@ def test_levenberg_marquardt_solves_sums_of_squares():
 def test_a_budget_of_evaluations_is_used_by_all():
     budget = Budget(evaluations=3000)
     small = Benchmark(("rastrigin",), tuple(choose(["pso", "de", "ifoa", "shade-cma"], None, (), budget)),
-                      dimensions=4, runs=2, evaluations=3000)  # fmt: skip
+                      dimensions=(4,), runs=2, evaluations=3000)  # fmt: skip
     for r in run_study(small, Journal(None)):
         assert 2900 <= r.evaluations <= 3200
 

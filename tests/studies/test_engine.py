@@ -29,7 +29,7 @@ SMALL = {"population": 10, "iterations": 20}
 STUDY = Benchmark(
     ("sphere", "rosenbrock"),
     (Entry("pso", "pso", SMALL), Entry("de", "de", SMALL)),
-    dimensions=3,
+    dimensions=(3,),
     runs=12,
     tolerance=1e-2,
 )
@@ -311,7 +311,7 @@ def test_resuming_without_a_journal_starts(expected, tmp_path):
 
 def test_the_journal_of_another_study_is_refused(tmp_path):
     path = stopped(tmp_path)
-    other = Benchmark(STUDY.functions, STUDY.entries, 3, 13, tolerance=1e-2)
+    other = Benchmark(STUDY.functions, STUDY.entries, (3,), 13, tolerance=1e-2)
     with pytest.raises(DataError, match="another study or version"):
         Journal.open(path, other, True)
     path.write_text("not a journal\n")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from accelcal_cli.errors import ConfigError
-from accelcal_cli.studies.functions import FUNCTIONS, PAPER, TestFunction, select
+from accelcal_cli.studies.functions import FUNCTIONS, PAPER, TestFunction, rotations, select
 
 D = 5
 VARIANTS = [{}, {"shift": True}, {"rotate": True}, {"shift": True, "rotate": True}]
@@ -109,9 +109,54 @@ def test_the_modified_rosenbrock_starts_from_its_own_box():
     assert (high == 1).all()
 
 
+def test_a_shift_moves_the_box_of_the_starting_points():
+    """As far as the optimum, which stays where it was in it; what would leave the box ends at its wall."""
+    plain = TestFunction("modified-rosenbrock", D)
+    moved = TestFunction("modified-rosenbrock", D, shift=True, seed=3)
+    offset = moved.optimum - plain.optimum
+    assert (np.abs(offset) > 1).any()
+    for own, other, wall in zip(moved.start, plain.start, ("upper", "lower"), strict=True):
+        np.testing.assert_allclose(own, np.clip(other + offset, moved.lower, moved.upper), rtol=1e-12)
+        assert (own != getattr(moved, wall)).all()
+
+
+def test_rotations_are_uniform_over_all_rotations():
+    """Orthogonal, determinant 1; images of the axes uniform on the sphere: moments 1 / D and 3 / (D (D + 2))."""
+    Q = rotations(np.random.default_rng(1).standard_normal((20_000, 3, 3)))
+    np.testing.assert_allclose(Q @ Q.swapaxes(1, 2), np.broadcast_to(np.eye(3), Q.shape), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(Q), 1.0, rtol=1e-12)
+    for column in range(3):
+        for row in range(3):
+            entry = Q[:, row, column]
+            assert abs(entry.mean()) < 0.02
+            assert (entry**2).mean() == pytest.approx(1 / 3, abs=0.01)
+            assert (entry**4).mean() == pytest.approx(1 / 5, abs=0.01)
+    trace = np.einsum("kii->k", Q)  # the angle of a Haar rotation in 3-D: E tr = 0, E tr^2 = 1
+    assert (trace.mean(), (trace**2).mean()) == pytest.approx((0.0, 1.0), abs=0.03)
+
+
+@pytest.mark.parametrize("name", ["griewank", "modified-rosenbrock", "zakharov"])
+def test_runs_have_instances_of_their_own(name):
+    many = TestFunction(name, D, shift=True, rotate=True, seed=4, instances=[3, 1, 2])
+    x = np.random.default_rng(0).uniform(many.lower, many.upper, (3, 7, D))
+    for row, instance in enumerate([3, 1, 2]):
+        one = TestFunction(name, D, shift=True, rotate=True, seed=4, instances=[instance])
+        part = many.take(np.array([row]))
+        np.testing.assert_array_equal(one.optimum, many.optimum[row, 0])
+        np.testing.assert_allclose(many.cost(x)[row], one.cost(x[row : row + 1])[0], rtol=1e-12)
+        np.testing.assert_allclose(part.cost(x[row : row + 1]), one.cost(x[row : row + 1]), rtol=1e-12)
+        if many.has_residuals:
+            np.testing.assert_allclose(many.jacobian(x)[row], one.jacobian(x[row : row + 1])[0], rtol=1e-9)
+        if many.start is not None:
+            np.testing.assert_array_equal(part.start[0][0, 0], one.start[0])
+    assert len({float(value) for value in many.cost(0 * x)[:, 0]}) == 3
+
+
 def test_functions_are_chosen_by_name():
     assert select([]) == PAPER
-    assert select(["sphere", "all"]) == tuple(FUNCTIONS)
+    everyone = tuple(name for name in FUNCTIONS if name != "modified-rosenbrock")
+    assert select(["sphere", "all"]) == everyone  # Rosenbrock's counts once
+    assert set(select(["all", "modified-rosenbrock"])) == set(FUNCTIONS)
     assert select(["levy", "sphere"]) == ("levy", "sphere")
     with pytest.raises(ConfigError, match='did you mean "griewank"'):
         select(["griewangk"])

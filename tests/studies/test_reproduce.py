@@ -91,12 +91,12 @@ def test_runs_and_seed_can_be_changed():
 def test_parts_number_their_cells_through():
     experiment = reproduce.load("ifoa-calibration").changed(2, None)
     study = experiment
-    first, second, third = experiment.parts
+    first, second, third, *rest = experiment.parts
     last = len(first.optimizers) + len(second.optimizers) - 1
-    assert study.cells == last + 1 + len(third.optimizers)
+    assert study.cells == last + 1 + sum(len(part.optimizers) for part in (third, *rest))
     assert study.names(0) == {"part": first.title, "function": "calibration", "optimizer": "Newton"}
     assert (study.names(last)["part"], study.names(last)["optimizer"]) == (second.title, "several radii")
-    assert study.names(last + 1)["part"] == third.title
+    assert study.names(last + 1)["part"] == f"{third.title}, half-width, pulses 1e4"
     assert [task.cell for task in study.tasks()] == list(range(study.cells))
     records = study.execute(Task(last, 0, 2))
     assert {r.cell for r in records} == {last}
@@ -123,7 +123,66 @@ def test_the_papers_rows_stand_under_ours():
     assert with_paper_rows(ours, None) is ours
 
 
+# Sensitivity
+
+
+def test_variants_of_a_part_are_parts_and_their_table_tells_what_varies():
+    """Newton's success falls with the half-width of the starts: rows as computed from the records here."""
+    experiment = reproduce.load("ifoa-calibration").changed(8, None)
+    parts = tuple(part for part in experiment.parts if part.varies)
+    assert [part.value for part in parts] == ["1e4", "3e4", "1e5", "2e5"]
+    assert len({part.search.start.bias for part in parts}) == 4
+    assert {part.search.g for part in parts} == {9.8}
+    experiment = dataclasses.replace(experiment, parts=parts)
+    records = run_study(experiment, Journal(None))
+    (table,) = experiment_tables(experiment, records)
+    assert [row[table.columns.index(table.columns[0])] for row in table.rows] == ["1e4", "3e4", "1e5", "2e5"]
+    for number, row in enumerate(table.records()):
+        own = [r for r in records if r.cell == number]
+        cost = [r.cost for r in own]
+        assert row["success_rate"] == np.mean([r.hit is not None for r in own])
+        assert [row["min"], row["median"], row["max"]] == [min(cost), np.median(cost), max(cost)]
+        assert [row["lower_quartile"], row["upper_quartile"]] == pytest.approx(
+            np.quantile(cost, [0.25, 0.75])
+        )
+    assert table.records()[0]["success_rate"] == 1.0 > table.records()[3]["success_rate"]
+
+
+def test_ratios_and_best_points_are_those_of_the_records():
+    experiment = reproduce.load("ifoa-rosenbrock").changed(4, None)
+    parts = (experiment.parts[0], *(part for part in experiment.parts if part.value == "10, 200"))
+    experiment = dataclasses.replace(experiment, parts=parts)
+    records = run_study(experiment, Journal(None))
+    tables = {table.title: table.records() for table in experiment_tables(experiment, records)}
+    ifoa = [r for r in records if experiment.names(r.cell)["optimizer"] == "IFOA"]
+    x = np.array([r.point for r in ifoa if r.cell == 2])
+    mean, rmse = tables["Modified Rosenbrock, D = 3: best points over the runs"][4:6]
+    assert (mean["optimizer"], mean["quantity"], rmse["quantity"]) == ("IFOA", "mean", "rmse")
+    assert [mean["x1"], mean["x3"]] == pytest.approx([x[:, 0].mean(), x[:, 2].mean()])
+    assert rmse["x2"] == pytest.approx(np.sqrt(np.mean((x[:, 1] + 1.0) ** 2)))
+    full, own = tables["IFOA over full-parameter FOA against flies and generations"]
+    costs = [np.array([r.cost for r in records if r.cell == cell]) for cell in (3, 4)]
+    assert full["ratio"] is None
+    assert own["ratio"] == pytest.approx(np.log10(costs[0].mean() / costs[1].mean()))
+    assert own["median_ratio"] == pytest.approx(np.log10(np.median(costs[0]) / np.median(costs[1])))
+
+
 # What has to hold
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "less", "more"),
+    [
+        ("dpso-figure2", "PSO", "PSO, r per particle", 1e4),
+        ("dpso-figure2", "DE-PSO, r per particle", "DE-PSO", 1e4),
+        ("akpso-calibration", "AKPSO 4-state", "AKPSO 4-state, r per particle", 1e6),
+        ("akpso-calibration", "PSO", "PSO, r per particle", 1e12),
+    ],
+)
+def test_what_r_is_decides_the_claims(name, label, less, more):
+    """One random number per coordinate, or per particle: the median cost differs by orders of magnitude."""
+    rows, _ = rows_of(reduced(name, 3, [label, less]))
+    assert rows[label]["cost"] > more * rows[less]["cost"]
 
 
 def test_shade_cma_betters_every_row_of_dpso_table_2():
@@ -192,7 +251,8 @@ def test_ifoa_calibrates_and_a_fixed_radius_does_not():
     assert 20_000 < rows["IFOA"]["evaluations"] < 28_000  # ten a generation
     assert 0.55 <= rows["Newton"]["success_rate"] <= 0.9
     assert rows["Levenberg-Marquardt"]["success_rate"] == 1
-    alone = experiment_tables(reduced("ifoa-calibration", 40, labels), records)[1].records()
+    tables = experiment_tables(reduced("ifoa-calibration", 40, labels), records)
+    alone = next(table for table in tables if "successful runs alone" in table.title).records()
     assert alone[0]["cost"] < alone[1]["cost"]  # Newton, where it succeeds, ends below IFOA
     fixed = reduced("ifoa-calibration", 10, ["fixed radius"])
     entry = dataclasses.replace(fixed.parts[0].optimizers[0], parameters={"population": 10, "radius": 1e4})
@@ -221,7 +281,7 @@ def test_fading_hurts_and_kpso_stays_on_its_floor():
     rows, records = rows_of(experiment)
     assert rows["AKPSO 4-state"]["cost"] < 1e-3 * rows["AKPSO fading 1"]["cost"]
     assert rows["KPSO"]["cost"] > 1e-3
-    table = experiment_tables(experiment, records)[1]
+    table = next(t for t in experiment_tables(experiment, records) if "median cost" in t.title)
     row = next(r for r in table.rows if r[0] == "KPSO")
     assert len(row) == len(reproduce.CHECKPOINTS) + 1
     assert list(row[2:]) == sorted(row[2:], reverse=True)

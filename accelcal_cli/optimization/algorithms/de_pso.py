@@ -23,7 +23,7 @@ from accelcal_cli.optimization.operators import (
     mutated_genes,
     partners,
 )
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, RANDOMS, Optimizer, Randoms
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -60,6 +60,7 @@ class HybridSwarm(Optimizer[HybridState]):
     weight: float = setting(0.2, "weight of the difference vector (F)", above=0, high=2)
     crossover: float = setting(0.4, "probability to keep the parent's gene (P_c)", low=0, high=1)
     speed: float = setting(0.2, "velocity limit as a part of the half box (v_max)", above=0, high=100)
+    randoms: Randoms = setting("coordinate", RANDOMS)
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> HybridState:
         """Press the two sub-populations into different halves of the box along the first coordinate."""
@@ -83,7 +84,9 @@ class HybridSwarm(Optimizer[HybridState]):
     def _moved(self, problem: Problem, state: HybridState, rng: Streams) -> tuple[Float, Float]:
         """Return both halves' next points and the swarm's velocities."""
         (population, dimensions), half = state.x.shape[1:], state.velocity.shape[1]
-        r1, r2, picks, mutated = rng.ahead(self._choices, population - half, 3 * dimensions + 3)
+        r1, r2, picks, mutated = rng.ahead(
+            self._choices, population - half, 2 * self._width(dimensions) + dimensions + 3
+        )
         x, curve = np.empty_like(state.x), self._curve(state.iteration)
         low, high = problem.limits
         limit = 0.5 * self.speed * (high - low)
@@ -102,14 +105,20 @@ class HybridSwarm(Optimizer[HybridState]):
     def _choices(self, u: Float) -> tuple[Float, Float, Int, Float]:
         """Return r1 and r2, partners n and m, shape (R, K, 2, P/2), and where a trial takes the mutant's gene.
 
-        r1, r2 and the genes are of shape (R, K, P/2, D).
+        The genes are of shape (R, K, P/2, D), r1 and r2 likewise or, one per particle, of (R, K, P/2, 1).
         """
-        rest, dimensions = u.shape[2], u.shape[3] // 3 - 1
-        r1, r2, genes = (u[..., k * dimensions : (k + 1) * dimensions] for k in range(3))
+        rest, columns = u.shape[2], u.shape[3] - 3
+        dimensions = columns // 3 if self.randoms == "coordinate" else columns - 2
+        width = self._width(dimensions)
+        r1, r2, genes = u[..., :width], u[..., width : 2 * width], u[..., 2 * width : -3]
         picks = integers(u[..., -3:], rest - 1, rest - 2, dimensions)
         mutated = mutated_genes(genes, self.crossover, picks[..., 2, :])
         partners(picks[..., :2, :])
         return r1, r2, picks[..., :2, :], mutated
+
+    def _width(self, dimensions: int) -> int:
+        """Return how many numbers each pull of a particle takes."""
+        return dimensions if self.randoms == "coordinate" else 1
 
     def _curve(self, iteration: int) -> float:
         """Return 1 / (1 + a b^(100 k / k_max)), which rises from 1 / (1 + a) to 1."""

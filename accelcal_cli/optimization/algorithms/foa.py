@@ -8,6 +8,7 @@ minimum with a negative coordinate cannot be reached. The IFOA paper removes tha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -39,12 +40,21 @@ class FruitFly(Optimizer[PlaneState]):
     population: int = setting(50, "flies of a swarm (n)", low=4, high=1_000_000)
     iterations: int = setting(300, "generations (Maxgen)", low=1, high=100_000_000)
     radius: float = setting(1.0, "search radius, in the problem's own units", above=0, high=1e12)
+    start: Literal["point", "plane"] = setting(
+        "point", "point: 1 / distance is the first starting point; plane: X and Y uniform within the radius"
+    )
+    outside: Literal["wall", "swarm"] = setting(
+        "wall", "a coordinate S outside the box goes to the wall, or stays where its swarm is"
+    )
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> PlaneState:
-        """Put the swarm where 1 / distance is the size of the first starting point (steps 1 to 3)."""
-        start = 1.0 / np.maximum(np.abs(x[:, :1]), 1e-12)
-        angle = 2.0 * np.pi * rng.uniform(1, x.shape[2])
-        axis = np.concatenate((start * np.cos(angle), start * np.sin(angle)), axis=2)
+        """Place the swarm in the plane (steps 1 to 3)."""
+        if self.start == "plane":
+            axis = self.radius * (2.0 * rng.uniform(1, 2 * x.shape[2]) - 1.0)
+        else:
+            start = 1.0 / np.maximum(np.abs(x[:, :1]), 1e-12)
+            angle = 2.0 * np.pi * rng.uniform(1, x.shape[2])
+            axis = np.concatenate((start * np.cos(angle), start * np.sin(angle)), axis=2)
         candidates = self._candidates(problem, axis, x.shape[1])
         fx = problem.cost(candidates)
         return PlaneState(candidates, fx, axis, fx[:, 0])
@@ -54,6 +64,10 @@ class FruitFly(Optimizer[PlaneState]):
         population, dimensions = state.x.shape[1:]
         u = 2.0 * rng.uniform(population, 2 * dimensions) - 1.0
         flies = state.axis + self.radius * u  # step 2
+        if self.outside == "swarm":
+            S = 1.0 / np.maximum(_distance(flies), 1e-12)
+            beyond = (problem.lower > S) | (problem.upper < S)
+            flies = np.where(np.concatenate((beyond, beyond), axis=2), state.axis, flies)
         candidates = self._candidates(problem, flies, population)
         fx = problem.cost(candidates)  # step 4
         axis, smell = moved_to_best(state.axis, state.smell, flies, fx)  # steps 5 and 6
@@ -61,6 +75,10 @@ class FruitFly(Optimizer[PlaneState]):
 
     def _candidates(self, problem: Problem, flies: Float, population: int) -> Float:
         """Return S = 1 / sqrt(X^2 + Y^2) in the box, shape (R, P, D) (step 3)."""
-        distance = np.hypot(*np.split(flies, 2, axis=2))
-        S = np.clip(1.0 / np.maximum(distance, 1e-12), problem.lower, problem.upper)
+        S = np.clip(1.0 / np.maximum(_distance(flies), 1e-12), problem.lower, problem.upper)
         return np.broadcast_to(S, (len(S), population, S.shape[2]))
+
+
+def _distance(flies: Float) -> Float:
+    """Return sqrt(X^2 + Y^2), shape (R, P, D), of X and Y side by side, shape (R, P, 2 D)."""
+    return np.asarray(np.hypot(*np.split(flies, 2, axis=2)))

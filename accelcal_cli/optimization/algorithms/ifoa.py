@@ -13,6 +13,7 @@ One radius serves all parameters, in the units of the readings. The authors name
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from accelcal_cli.schema import setting
 PART_OF_BOX = 0.4
 """Radius when none is stated, as a part of the first coordinate's half box: 2 % of a scale factor in the default
 box of 5 %, which is what the paper's 1e4 pulses are."""
+
+
+ROUNDINGS = {"floor": np.floor, "round": np.rint, "ceil": np.ceil}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,9 @@ class ImprovedFruitFly(Optimizer[FlyState]):
     radius_scale: tuple[float, ...] = setting(
         (1.0, 1.0, 1.0), "radius factor of each group: scale factors, misalignments, biases"
     )
+    rounding: Literal["floor", "round", "ceil", "1+floor"] = setting(
+        "floor", "how the exponent p becomes a whole number, which the lost formula may do in another way"
+    )
 
     def __post_init__(self) -> None:
         """Refuse a radius factor that is not positive."""
@@ -86,8 +93,10 @@ class ImprovedFruitFly(Optimizer[FlyState]):
 
     def exponent(self, state: FlyState) -> Float:
         """Return p, shape (R,): 0 above the threshold, else floor(log10(sigma / Smell_best)). [ifoa2021] section 6."""
-        p = np.floor(np.log10(state.threshold / np.maximum(state.smell, 1e-300)))
-        return np.maximum(p, 0.0)
+        decades = np.log10(state.threshold / np.maximum(state.smell, 1e-300))
+        if self.rounding == "1+floor":
+            return np.where(decades < 0.0, 0.0, 1.0 + np.floor(decades))
+        return np.maximum(ROUNDINGS[self.rounding](decades), 0.0)
 
     def reach(self, problem: Problem) -> Float:
         """Return Delta of every coordinate in the problem's coordinates, shape (1 or R, 1, D)."""

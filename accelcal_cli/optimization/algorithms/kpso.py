@@ -13,7 +13,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.optimization.operators import best_of, moved_to_best
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, RANDOMS, Optimizer, Randoms, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -45,6 +45,7 @@ class KalmanSwarm(Optimizer[FilterState]):
     noise: float = setting(
         0.01, "variance of start, process and observation as part of the range (epsilon)", above=0
     )
+    randoms: Randoms = setting("particle", RANDOMS)
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> FilterState:
         """Start at rest."""
@@ -59,7 +60,7 @@ class KalmanSwarm(Optimizer[FilterState]):
         """Observe, filter, predict, and sample the next positions."""
         population, dimensions = state.x.shape[1:]
         half = problem.half_width
-        pull = 2.0 * rng.uniform(population, 1)
+        pull = 2.0 * rng.uniform(population, dimensions if self.randoms == "coordinate" else 1)
         z = (state.x + pull * (state.leader - state.x) - problem.lower) / half - 1.0
         Pm = F @ state.covariance @ F.T + self._q() * np.eye(2)
         gain = Pm[:, :, 0] / (Pm[:, 0, 0] + self._q())[:, None]

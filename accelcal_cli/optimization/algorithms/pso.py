@@ -13,7 +13,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.optimization.operators import best_of, better_of, clip
-from accelcal_cli.optimization.optimizer import OPTIMIZERS, Optimizer, State
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, RANDOMS, Optimizer, Randoms, State
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
@@ -42,7 +42,8 @@ def velocity(
 ) -> Float:
     """Return w v + c1 r1 (leader - x) + c2 r2 (memory - x), [dpso2014] eq. 1, where c1 goes with the global best.
 
-    All of shape (R, P, D), but leader (R, D); r1 and r2 are uniform numbers, inertia is w, social c1, cognitive c2.
+    All of shape (R, P, D), but leader (R, D); r1 and r2 are uniform numbers, (R, P, 1) where a particle has one for all
+    coordinates; inertia is w, social c1, cognitive c2.
     """
     to_leader = leader[:, None] - x
     to_leader *= r1
@@ -69,6 +70,7 @@ class ParticleSwarm(Optimizer[SwarmState]):
     cognitive: float = setting(1.49618, "pull towards the own best (c2)", low=0, high=10)
     speed: float = setting(0.2, "velocity limit as a part of the half box (v_max)", above=0, high=100)
     draws: int = setting(1, "uniform numbers averaged for each pull", low=1, high=100)
+    randoms: Randoms = setting("coordinate", RANDOMS)
 
     def init(self, problem: Problem, x: Float, rng: Streams) -> SwarmState:
         """Start at rest: v = 0."""
@@ -78,7 +80,8 @@ class ParticleSwarm(Optimizer[SwarmState]):
     def step(self, problem: Problem, state: SwarmState, rng: Streams) -> SwarmState:
         """Move the swarm once."""
         x, (population, dimensions) = state.x, state.x.shape[1:]
-        r1, r2 = rng.ahead(self._pulls, population, self.draws * 2 * dimensions)
+        width = dimensions if self.randoms == "coordinate" else 1
+        r1, r2 = rng.ahead(self._pulls, population, self.draws * 2 * width)
         pulls = self.inertia, self.social, self.cognitive
         v = velocity(x, state.velocity, state.memory, state.leader, r1, r2, *pulls)
         low, high = problem.limits
@@ -93,5 +96,5 @@ class ParticleSwarm(Optimizer[SwarmState]):
     def _pulls(self, u: Float) -> tuple[Float, Float]:
         """Return r1 and r2, each the mean of `draws` of the uniform numbers u, shape (R, K, P, D)."""
         means = np.add.reduce(np.split(u, self.draws, axis=3)) / self.draws if self.draws > 1 else u
-        dimensions = means.shape[3] // 2
-        return means[..., :dimensions], means[..., dimensions:]
+        width = means.shape[3] // 2
+        return means[..., :width], means[..., width:]

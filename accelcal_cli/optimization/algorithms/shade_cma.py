@@ -81,6 +81,7 @@ class ShadeCma(Optimizer[ShadeState | CmaState]):
     memory: int = setting(6, "entries of the success history (H)", low=1, high=1000)
     greed: float = setting(0.2, "part of the population that may lead (p)", above=0, high=1)
     archive: float = setting(1.4, "archive size, part of the population", low=0, high=10)
+    samples: int | None = setting(None, "lambda of phase two, where it is not `smallest`", low=4, high=1000)
 
     @property
     def points_per_run(self) -> int:
@@ -100,7 +101,7 @@ class ShadeCma(Optimizer[ShadeState | CmaState]):
         if isinstance(state, CmaState):
             return _cma_step(problem, state, rng, self.evaluations)
         if state.used + state.x.shape[1] > self.phase_one * self.evaluations:
-            first = _cma_start(state.x, state.fx, self.smallest, state.used)
+            first = _cma_start(state.x, state.fx, self.samples or self.smallest, state.used)
             return _cma_step(problem, first, rng, self.evaluations)
         return self._generation(problem, state, rng)
 
