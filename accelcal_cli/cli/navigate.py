@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
 from accelcal_cli.cli import options, running
 from accelcal_cli.errors import UsageError
 
@@ -30,7 +32,7 @@ def command(
         in_filters(
             "--filter",
             help="Filters, separated by commas or repeated: {choices}.",
-            show_default="all, or the file's",
+            show_default="de-pf, point-mass, or the file's",
             metavar="NAMES",
             autocompletion=options.several_of(lambda: [*options.filters(), ALL]),
         ),
@@ -53,10 +55,13 @@ def command(
         str | None,
         in_voyage(
             "--map",
-            help="{choices} (generated), or a file: NetCDF, GeoTIFF, XYZ text.",
+            help="{choices} (generated), or a file: NetCDF, GeoTIFF, ICGEM grid, XYZ text.",
             show_default="rough",
             autocompletion=options.one_of(MAPS),
         ),
+    ] = None,
+    variable: Annotated[
+        str | None, in_voyage(help="Variable of a NetCDF map with several.", metavar="NAME")
     ] = None,
     voyage: Annotated[
         str | None, in_voyage(help="CSV file of a recorded voyage.", show_default="a planned one")
@@ -98,12 +103,14 @@ def command(
 ) -> None:
     """Navigate by inertia and gravity, simulated or recorded.
 
-    Prints the position error over hours 3 to 8, the smallest that any filter could have (the posterior Cramer-Rao
-    bound), how many runs lost lock, and whether the claimed spread fits the error (NEES, 2 when it does).
+    Prints the position error from an hour after the start, the least that any filter can have (the posterior
+    Cramer-Rao bound), how many runs lost lock, and whether the claimed spread fits the error (NEES, 2 when it does) and
+    the innovations (NIS, 1 when it does). On a recorded voyage innovations that do not fit give a warning and exit
+    code 1.
     """
-    from accelcal_cli.navigation.study import Navigation, load_study
+    from accelcal_cli.navigation.study import Navigation, are_suspect, load_study
     from accelcal_cli.studies.study import words
-    from accelcal_cli.views.navigation import summary
+    from accelcal_cli.views.navigation import shown, summary
 
     options.check_plot(plot)
     if mode is not None:
@@ -112,12 +119,17 @@ def command(
         options.check_choice("--prior", prior, PRIORS)
     if output == "-" and format != "table":
         raise UsageError(f"-o - prints the curves; leave out --format {format}")
-    setting = options.stated(map=map, voyage=voyage, period=period, prior=prior)
+    setting = options.stated(map=map, variable=variable, voyage=voyage, period=period, prior=prior)
     limits = {"particles": particles, "generations": generations}
     repeats = options.stated(runs=runs, seed=seed)
     settings = load_study(config, {**setting, **repeats})
     entries = _entries(words(filter or ()), settings.filters, mode, limits)
     grades: tuple[InsGrade, ...] = (settings.ins,)
+    if calibration is not None and settings.voyage:
+        raise UsageError(
+            "--calibration does not apply to --voyage: the record holds the errors that its INS had; leave one of "
+            "them out"
+        )
     if calibration is not None:
         settings, grades = _calibrated(settings, calibration)
     study = Navigation(settings.with_digests(), tuple(entries), grades)
@@ -126,19 +138,21 @@ def command(
     records = study_options.run(study)
     rows = summary(study, records)
     if output != "-":
-        options.print_result(format, rows, lambda: [rows])
+        options.print_result(format, rows, lambda: [shown(rows)])
     _write(study, records, output, plot)
     options.tell_written([study_options.raw, output, plot], study_options.quiet)
+    if are_suspect(study, records):
+        raise typer.Exit(options.BAD_VERDICT)
 
 
 def _entries(
     names: Sequence[str], own: Sequence[FilterEntry], mode: str | None, limits: Mapping[str, Any]
 ) -> list[FilterEntry]:
     """Return the filters by name or label, in the modes that were asked for."""
-    from accelcal_cli.navigation.study import FilterEntry, filter_names
+    from accelcal_cli.navigation.study import DEFAULT_SET, FilterEntry, filter_names
 
     stated = {entry.name: entry for entry in own}
-    wanted = list(names) or list(stated) or [ALL]
+    wanted = list(names) or list(stated) or list(DEFAULT_SET)
     if ALL in wanted:
         wanted = list(dict.fromkeys([*stated, *filter_names()]))
     chosen = [stated.get(name) or FilterEntry(name) for name in wanted]

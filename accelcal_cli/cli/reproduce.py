@@ -86,13 +86,13 @@ def _voyage(
 ) -> None:
     """Run an experiment on navigation filters and print it beside the paper's numbers."""
     from accelcal_cli.navigation.study import Navigation, load_study
-    from accelcal_cli.views.navigation import chart_of, curves, summary, with_paper
+    from accelcal_cli.views.navigation import chart_of, curves, shown, summary, with_paper
 
     settings = load_study(name, {"runs": runs, "seed": seed})
     study = Navigation(settings, settings.filters, (settings.ins,))
     records = study_options.run(study)
     table = with_paper(summary(study, records), settings)
-    _print(name, settings.title, [table], [table], format)
+    _print(name, settings.title, [table], [shown(table)], format)
     if plot is not None:
         from accelcal_cli.output.plot import plot_voyage
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -108,19 +108,20 @@ def evolve_all(
 ) -> tuple[Cloud, float, Bool]:
     """As printed: all particles move at every epoch toward the fitness, and are then weighed by it."""
     before = cloud.before if form.fitness == "transition" else None
-    likelihood = CountedFitness(lambda position: form.likelihood(scenario, k, position))
+    likelihood = CountedFitness(lambda position: form.likelihood(scenario, cloud, k, position))
 
     def fitness(position: Float) -> Float:
         if before is None:
             return likelihood(position)
         away = np.square(position - before).sum(axis=2)
-        prior: Float = 0.5 * away / form.step_noise(scenario) ** 2  # [depf2015] eq. 2
-        return likelihood(position) - prior
+        return np.asarray(
+            likelihood(position) - 0.5 * away / form.step_noise(scenario) ** 2
+        )  # [depf2015] eq. 2
 
     x = cloud.x.copy()
     level = fitness(x[..., :2])
     x[..., :2] = form.evolve(x[..., :2], level, form.particles, fitness, streams)
-    weighed = Cloud(x, cloud.log_weights + fitness(x[..., :2]))
+    weighed = replace(cloud, x=x, log_weights=cloud.log_weights + fitness(x[..., :2]))
     return weighed, likelihood.points / scenario.runs, level.max(axis=1) > BLIND
 
 
@@ -140,25 +141,26 @@ def move_worst(
     """
     mean, covariance = moments(prior, cloud.x[..., :2])
     scale = np.sqrt(np.einsum("rii->ri", covariance)) + 1e-9
-    fitness = posterior(form, recent, mean, covariance)
+    order = np.argsort(cloud.log_weights, axis=1, kind="stable")
+    x, level = (np.take_along_axis(part, order[:, :, None], axis=1) for part in (cloud.x, cloud.level))
+    logs = np.take_along_axis(cloud.log_weights, order, axis=1)
+    cloud = replace(cloud, x=x.copy(), level=level, log_weights=logs)
+    fitness = posterior(form, recent, cloud, mean, covariance)
 
     def gated(position: Float) -> Float:
         inside = (np.abs(position - mean[:, None]) <= GATE * scale[:, None]).all(axis=2)
         return np.where(inside, fitness(position), -np.inf)
 
     rate = CountedFitness(gated)
-    order = np.argsort(cloud.log_weights, axis=1, kind="stable")
-    x = np.take_along_axis(cloud.x, order[:, :, None], axis=1)
-    logs = np.take_along_axis(cloud.log_weights, order, axis=1)
     movers = max(1, round(form.fraction * form.particles))
     position = x[..., :2]
     moved = form.evolve(position, rate(position), movers, rate, streams)[:, :movers]
     inside = np.isfinite(rate(moved))[:, :, None]
     x[:, :movers, :2] = np.where(inside, moved, position[:, :movers])
     share = np.take_along_axis(prior / prior.max(axis=1, keepdims=True), order, axis=1)[:, :movers]
-    likelihood = form.likelihood(recent, recent.epochs - 1, x[:, :movers])
+    likelihood = form.likelihood(recent, cloud, recent.epochs - 1, x[:, :movers])
     logs[:, :movers] = likelihood + np.log(share.mean(axis=1, keepdims=True) + 1e-300)
-    return Cloud(x, logs), rate.points * recent.epochs + likelihood.size
+    return replace(cloud, x=x), rate.points * recent.epochs + likelihood.size
 
 
 def evolve_degenerate(
@@ -168,28 +170,29 @@ def evolve_degenerate(
     k: int,
     streams: Streams,
     move: Move = move_worst,
-    memory: int = 1,
+    span: float = 0.0,
 ) -> tuple[Cloud, float, Bool]:
-    """Weigh the particles, and move them in the runs whose weights degenerate; W = memory measurements count."""
+    """Weigh the particles, and move them where the weights degenerate; the measurements of a span in s count."""
     predicted = cloud.log_weights
     cloud, lookups, on_map = ParticleFilter.update(form, scenario, cloud, k, streams)
     rows = np.flatnonzero(form.degenerate(normalise(cloud.log_weights)))
     if len(rows):
-        recent = scenario.part(rows, max(0, k + 1 - memory), k + 1)
-        part = Cloud(cloud.x[rows], cloud.log_weights[rows])
-        part, points = move(form, recent, part, normalise(predicted[rows]), streams.take(rows))
-        cloud.x[rows], cloud.log_weights[rows] = part.x, part.log_weights
+        recent = scenario.part(rows, max(0, k + 1 - scenario.epochs_in(span)), k + 1)
+        part, points = move(form, recent, cloud.part(rows), normalise(predicted[rows]), streams.take(rows))
+        cloud.x[rows], cloud.log_weights[rows], cloud.level[rows] = part.x, part.log_weights, part.level
         lookups += points / scenario.runs
     return cloud, lookups, on_map
 
 
-def posterior(form: EvolvingFilter, recent: Scenario, mean: Float, covariance: Float) -> Fitness:
+def posterior(
+    form: EvolvingFilter, recent: Scenario, cloud: Cloud, mean: Float, covariance: Float
+) -> Fitness:
     """Return the logarithm of the likelihood of the recent measurements times the Gaussian of the predicted cloud.
 
     Of several measurements it is the likelihood that holds if the position error is the same at all of them.
 
     Args:
-        form: the filter; recent: the measurements.
+        form: the filter; recent: the measurements; cloud: whose first particles stand at the positions.
         mean, covariance: of the predicted positions, shape (R, 2) and (R, 2, 2).
     """
     inverse = np.linalg.inv(covariance + 1e-6 * np.eye(2))
@@ -199,7 +202,7 @@ def posterior(form: EvolvingFilter, recent: Scenario, mean: Float, covariance: F
         distance = ((away @ inverse) * away).sum(axis=2)
         likelihood = np.zeros(position.shape[:2])
         for epoch in range(recent.epochs):
-            likelihood += form.likelihood(recent, epoch, position)
+            likelihood += form.likelihood(recent, cloud, epoch, position)
         likelihood -= 0.5 * distance
         return likelihood
 

@@ -1,71 +1,27 @@
-"""What a navigation filter is, and the generic particle filter: sampling, importance, resampling [gordon1993].
+"""The generic particle filter: sampling, importance, resampling [gordon1993].
 
 Everything is batched over R runs. Weights of N particles have the shape (R, N) and are kept as logarithms until they
 are needed; random numbers come from the stream of each run.
 
-The state is the position error alone, a random walk (`state: 2`), or all twelve errors of the INS (`state: 12`).
+The state is the position error alone, a random walk (`state: 2`), or all twelve errors of the INS (`state: 12`). Given
+it, the bias of the gravimeter and the error of the map are Gaussian: every particle carries their mean.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
+from accelcal_cli.navigation.filter import Filter, PositionEstimates
 from accelcal_cli.navigation.ins import STATES, cholesky, process_noise
+from accelcal_cli.navigation.noise import EXTRA, NoiseModel, Offset
 from accelcal_cli.navigation.scenario import Scenario
-from accelcal_cli.registry import Registry
 from accelcal_cli.rng import Streams
-from accelcal_cli.schema import Checked, setting
-
-
-@dataclass(frozen=True)
-class PositionEstimates:
-    """What a filter estimates in R runs at K epochs.
-
-    Attributes:
-        mean: position error of the INS, m north and east, shape (R, K, 2).
-        covariance: its covariance, m^2, shape (R, K, 2, 2).
-        blind: number of epochs at which no particle was on the map, shape (R,).
-        lookups: look-ups of the map per run and epoch, on average.
-    """
-
-    mean: Float
-    covariance: Float
-    blind: Float
-    lookups: float
-
-    @classmethod
-    def empty(cls, scenario: Scenario) -> PositionEstimates:
-        """Return estimates that are still to be filled in."""
-        shape = scenario.runs, scenario.epochs
-        return cls(np.zeros((*shape, 2)), np.zeros((*shape, 2, 2)), np.zeros(shape[0]), 0.0)
-
-
-@dataclass(frozen=True)
-class Filter(Checked, ABC):
-    """A filter; its dataclass fields are its YAML keys.
-
-    Raises:
-        ConfigError: a setting out of range.
-    """
-
-    name: ClassVar[str]
-
-    mode: Literal["default", "literal"] = setting(
-        "default", "`literal`: as the paper prints it, with R as stated; `default`: R enlarged"
-    )
-
-    @abstractmethod
-    def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
-        """Return the filter's estimates; run r of the streams belongs to run r of the scenario."""
-
-
-FILTERS: Registry[Filter] = Registry(Filter, "accelcal_cli.navigation.filters", "filter", "accelcal.filters")
+from accelcal_cli.schema import setting
 
 OFF_MAP = -1e6
 """Log-likelihood of a position where the map has no value."""
@@ -74,19 +30,18 @@ BLIND = -1e5
 """Greatest log-likelihood of a cloud of which no particle is on the map: above OFF_MAP, below any misfit on it."""
 
 
-def log_likelihood(measured: Float, anomaly: Float, variance: float) -> Float:
-    """Return -(y - map)^2 / 2R, OFF_MAP where the map has no value, and 0 without a measurement.
+def rate_misfit(misfit: Float, measured: Bool, variance: Float | float) -> Float:
+    """Return -(y - map)^2 / 2R, OFF_MAP where the map has no value, and 0 without a measurement. [depf2015] eq. 2.
 
     Args:
-        measured: mGal, broadcast against anomaly; anomaly: mGal; variance: R, mGal^2. [depf2015] eq. 2.
+        misfit: y - map, mGal, overwritten; measured: whether there is a measurement; variance: R, mGal^2.
     """
-    misfit = measured - anomaly
     misfit *= misfit
     misfit *= -0.5 / variance
     unknown = np.isnan(misfit)
     if unknown.any():
         misfit[unknown] = OFF_MAP
-        misfit = np.where(np.isnan(measured), 0.0, misfit)
+        misfit = np.where(measured, misfit, 0.0)
     return misfit
 
 
@@ -162,12 +117,25 @@ class Cloud:
 
     Attributes:
         x: metric states, shape (R, N, D); log_weights: shape (R, N).
+        level: bias and map error of each particle, mGal, shape (R, N, 2); offset: their covariance.
         before: positions at the epoch before, shape (R, N, 2); None at the first epoch, and where nothing reads them.
     """
 
     x: Float
     log_weights: Float
+    level: Float
+    offset: Offset
     before: Float | None = None
+
+    @classmethod
+    def of(cls, x: Float, log_weights: Float, model: NoiseModel = NoiseModel()) -> Cloud:  # noqa: B008  # frozen
+        """Return particles that have measured nothing yet."""
+        return cls(x, log_weights, np.zeros((*x.shape[:2], EXTRA)), Offset.start(model, len(x)))
+
+    def part(self, rows: Int) -> Cloud:
+        """Return some of the runs."""
+        offset = Offset(self.offset.covariance[rows])
+        return Cloud(self.x[rows], self.log_weights[rows], self.level[rows], offset)
 
 
 CHUNK = 60
@@ -192,8 +160,9 @@ class ParticleFilter(Filter):
     resampling: Literal["systematic", "residual"] = setting("systematic", "scheme")
     state: Literal[2, 12] = setting(2, "position error alone, or all twelve errors")
 
-    def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
+    def track(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
         """Return the estimates: propagate, weigh, evolve, estimate, resample; [depf2015] steps 1 to 5."""
+        scenario = self._believed(scenario)
         estimates = PositionEstimates.empty(scenario)
         cloud = self._start(scenario, streams)
         F: Float = np.empty(0)
@@ -203,16 +172,64 @@ class ParticleFilter(Filter):
                 F = scenario.transitions(k - 1, min(k - 1 + CHUNK, scenario.epochs))
             if k:
                 step = F[:, (k - 1) % CHUNK] if self.state == STATES else None
-                cloud = Cloud(
-                    self._propagate(scenario, cloud.x, step, streams), cloud.log_weights, cloud.x[..., :2]
+                offset = cloud.offset.predict(scenario.model, scenario.decay[:, k - 1])
+                level = (
+                    cloud.level
+                    * np.stack([np.ones(scenario.runs), scenario.decay[:, k - 1]], axis=1)[:, None]
                 )
+                x = self._propagate(scenario, cloud.x, step, streams)
+                cloud = Cloud(x, cloud.log_weights, level, offset, cloud.x[..., :2])
+            used = self._gate(scenario, cloud, k, estimates)
             cloud, lookups, on_map = self.update(scenario, cloud, k, streams)
+            cloud = self._learn(scenario, cloud, k, used)
             weights = normalise(cloud.log_weights)
             estimates.mean[:, k], estimates.covariance[:, k] = moments(weights, cloud.x[..., :2])
             estimates.blind[:] += ~on_map
-            total += lookups
+            total += lookups + self.particles * (1 + bool(scenario.model.prior.any()))
             cloud = self._resample(cloud, weights, streams)
         return replace(estimates, lookups=total / scenario.epochs)
+
+    def _believed(self, scenario: Scenario) -> Scenario:
+        """Return the scenario as the state can tell it: without velocities the Eoetvoes error is one of the map."""
+        if not scenario.model.eotvos or self.state == STATES:
+            return scenario
+        error = np.square(scenario.coupling.mean(axis=(0, 1))) @ np.diagonal(scenario.prior)[2:4]
+        size = float(np.hypot(scenario.model.map_error, np.sqrt(error)))
+        return replace(scenario, models=(replace(scenario.model, map_error=size, eotvos=False),))
+
+    def residual(self, scenario: Scenario, cloud: Cloud, k: int, x: Float) -> Float:
+        """Return measured minus expected gravity at epoch k of states x of the first n particles, mGal, (R, n)."""
+        count = x.shape[1]
+        anomaly = scenario.anomaly(k, x[..., 0], x[..., 1])
+        if scenario.model.prior.any():
+            anomaly = anomaly + cloud.level[:, :count].sum(axis=2)
+        if scenario.model.eotvos:
+            anomaly = anomaly + (cloud.x[:, :count, 2:4] * scenario.coupling[:, k, None]).sum(axis=2)
+        return np.asarray(scenario.measured[:, k, None] - anomaly)
+
+    def _gate(self, scenario: Scenario, cloud: Cloud, k: int, estimates: PositionEstimates) -> Float:
+        """Note the innovations of epoch k, leave outliers out, and return which runs use theirs, shape (R,)."""
+        misfit = self.residual(scenario, cloud, k, cloud.x)
+        known = np.isfinite(misfit)
+        weights = np.where(known, normalise(cloud.log_weights), 0.0)
+        total = weights.sum(axis=1)
+        misfit = np.where(known, misfit, 0.0)
+        mean = (weights * misfit).sum(axis=1) / total
+        spread = (weights * np.square(misfit - mean[:, None])).sum(axis=1) / total
+        variance = spread + cloud.offset.variance + self.believed_variance(scenario)
+        used = estimates.note(k, mean, variance, scenario.model.gate)
+        scenario.measured[estimates.rejected[:, k] > 0.0, k] = np.nan
+        return used
+
+    def _learn(self, scenario: Scenario, cloud: Cloud, k: int, used: Float) -> Cloud:
+        """Return the cloud whose bias and map error have learned from epoch k, at every particle by itself."""
+        if not scenario.model.prior.any():
+            return cloud
+        variance = np.full(scenario.runs, self.believed_variance(scenario))
+        misfit = np.nan_to_num(self.residual(scenario, cloud, k, cloud.x))
+        gain = cloud.offset.gain(variance) * used[:, None]
+        level = cloud.level + gain[:, None] * misfit[:, :, None]
+        return replace(cloud, level=level, offset=cloud.offset.update(variance, used))
 
     def update(
         self,
@@ -222,14 +239,16 @@ class ParticleFilter(Filter):
         streams: Streams,  # noqa: ARG002  # an evolution draws from them
     ) -> tuple[Cloud, float, Bool]:
         """Return the cloud weighed by the measurement of epoch k, look-ups per run, and which runs are on the map."""
-        likelihood = self.likelihood(scenario, k, cloud.x)
+        likelihood = self.likelihood(scenario, cloud, k, cloud.x)
         on_map = likelihood.max(axis=1) > BLIND
-        return Cloud(cloud.x, cloud.log_weights + likelihood), self.particles, on_map
+        return replace(cloud, log_weights=cloud.log_weights + likelihood), self.particles, on_map
 
-    def likelihood(self, scenario: Scenario, k: int, x: Float) -> Float:
-        """Return the log-likelihood of particles x, shape (R, n, D), at epoch k."""
-        anomaly = scenario.anomaly(k, x[..., 0], x[..., 1])
-        return log_likelihood(scenario.measured[:, k, None], anomaly, self.believed_variance(scenario))
+    def likelihood(self, scenario: Scenario, cloud: Cloud, k: int, x: Float) -> Float:
+        """Return the log-likelihood at epoch k of states x, shape (R, n, D), of the first n particles of a cloud."""
+        measured = np.isfinite(scenario.measured[:, k])
+        misfit = self.residual(scenario, cloud, k, x)
+        variance = cloud.offset.variance[:, None] + self.believed_variance(scenario)
+        return rate_misfit(misfit, measured[:, None], variance)
 
     def believed_variance(self, scenario: Scenario) -> float:
         """Return R in mGal^2: as set, or that of the gravimeter, times four in mode default."""
@@ -249,7 +268,7 @@ class ParticleFilter(Filter):
         """Return the particles of step 1, drawn from the prior."""
         x = streams.normal(self.particles, self.state)
         x = x @ cholesky(scenario.prior[: self.state, : self.state]).T
-        return Cloud(x, np.zeros(x.shape[:2]))
+        return Cloud.of(x, np.zeros(x.shape[:2]), scenario.model)
 
     def _propagate(self, scenario: Scenario, x: Float, F: Float | None, streams: Streams) -> Float:
         """Return the particles one step on: a random walk of the position, or all errors by the transition F."""
@@ -266,4 +285,5 @@ class ParticleFilter(Filter):
         chosen = SCHEMES[self.resampling](weights, streams.uniform(1, 1)[:, 0, 0])
         chosen = np.where(low, chosen, np.arange(self.particles))
         logs = np.where(low, 0.0, cloud.log_weights - cloud.log_weights.max(axis=1, keepdims=True))
-        return Cloud(take_particles(cloud.x, chosen), logs)
+        level = take_particles(cloud.level, chosen) if cloud.level.any() else cloud.level
+        return Cloud(take_particles(cloud.x, chosen), logs, level, cloud.offset)

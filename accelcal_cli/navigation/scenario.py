@@ -1,26 +1,21 @@
 """What a filter is given: indicated trajectory, measured gravity, map and INS grade, for R runs at K epochs.
 
-A scenario is simulated, or comes from the CSV file of a recorded voyage. Columns by name, in any order: time (s),
-latitude, longitude (degrees, indicated by the INS); optional: gravity (mGal), east and north (indicated velocity, m/s),
-heading (indicated, degrees clockwise from north; needed for strapped-down sensors), true_latitude, true_longitude
-(degrees). An empty gravity cell is an epoch without a measurement.
+A scenario is simulated here, or comes from a recorded voyage (`recording`).
 
 The map must cover the trajectory: beyond its edge, or beside a hole, a filter could only be confidently wrong.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from accelcal_cli.arrays import Float, Int
-from accelcal_cli.errors import DataError, did_you_mean
+from accelcal_cli.errors import DataError
 from accelcal_cli.navigation.gravity_map import GravityMap
 from accelcal_cli.navigation.ins import (
     STATES,
@@ -29,17 +24,19 @@ from accelcal_cli.navigation.ins import (
     discretise,
     dynamics,
     metres_per_radian,
+    process_noise,
     to_metric,
     turn_biases,
 )
+from accelcal_cli.navigation.noise import EXTRA, Disturbance, NoiseModel, eotvos, eotvos_slope
 from accelcal_cli.navigation.voyage import (
     SECONDS_PER_HOUR,
     PlannedVoyage,
     Trajectory,
     aligned_covariance,
     ins_errors,
-    wrap_angle,
 )
+from accelcal_cli.notices import Notice
 from accelcal_cli.rng import Purpose, Streams
 
 VELOCITY_SIGMA, TILT_SIGMA, AZIMUTH_SIGMA = 0.6, 1e-4, 1e-3
@@ -59,6 +56,8 @@ class Scenario:
         measured: gravity anomaly, mGal, shape (R, K); NaN where there is none.
         prior: covariance of the metric states at the start, shape (12, 12): what the filters are told.
         error: true position error of the INS, m north and east, shape (R, K, 2); None when it is not known.
+        models: what a robust filter weighs, the nominal noise first; a filter that runs by one sees it alone.
+        notices: of the record.
         true: the true trajectory, shape (K,), or the indicated one when the true one is not known.
         turns: changes of the indicated heading between epochs, clockwise, rad, shape (K - 1,). Of the heading, not of
             the course by the indicated velocity: half a metre per second across 8 m/s would turn the biases by 4 deg.
@@ -74,6 +73,8 @@ class Scenario:
     error: Float | None
     true: Trajectory
     turns: Float
+    models: tuple[NoiseModel, ...] = (NoiseModel(),)
+    notices: tuple[Notice, ...] = ()
 
     @property
     def seconds(self) -> Float:
@@ -95,6 +96,10 @@ class Scenario:
         """Time between epochs. Units: s."""
         return self.ins.step
 
+    def epochs_in(self, span: float) -> int:
+        """Return the number of epochs in a span of seconds, at least 1."""
+        return max(1, round(span / self.period))
+
     @cached_property
     def scale(self) -> tuple[Float, Float]:
         """Metres per radian of latitude and of longitude at the indicated positions, shape (R, K)."""
@@ -111,6 +116,50 @@ class Scenario:
             F = turn_biases(F, np.append(self.turns, 0.0)[first:last])
         after = np.minimum(np.arange(first + 1, last + 1), self.epochs - 1)
         return to_metric(F, self.ins.latitude[..., first:last], self.ins.latitude[..., after])
+
+    def under(self, model: NoiseModel) -> Scenario:
+        """Return the scenario of a filter that believes in one noise model, and may leave measurements out."""
+        return replace(self, models=(model,), measured=np.array(self.measured))
+
+    @property
+    def model(self) -> NoiseModel:
+        """The noise model that a filter runs by."""
+        return self.models[0]
+
+    @cached_property
+    def decay(self) -> Float:
+        """Factor of the map's error from one epoch to the next, shape (R, K)."""
+        return self.model.decay(np.hypot(self.ins.east, self.ins.north) * self.period)
+
+    @cached_property
+    def coupling(self) -> Float:
+        """Measured gravity by east and north velocity error, mGal per m/s, shape (R, K, 2)."""
+        ins = self.ins
+        if not self.model.eotvos:
+            return np.zeros((*ins.latitude.shape, 2))
+        return eotvos_slope(ins.latitude, ins.east, ins.north)
+
+    def steps(self, first: int, last: int) -> Float:
+        """Return the transitions of all errors, with the two of the measurement, shape (R, last - first, 14, 14)."""
+        F = np.zeros((self.runs, last - first, STATES + EXTRA, STATES + EXTRA))
+        F[..., :STATES, :STATES] = self.transitions(first, last)
+        F[..., STATES, STATES] = 1.0
+        F[..., STATES + 1, STATES + 1] = self.decay[:, first:last]
+        return F
+
+    def full_prior(self) -> Float:
+        """Return the covariance of all errors at the start, with the two of the measurement, shape (14, 14)."""
+        P = np.zeros((STATES + EXTRA, STATES + EXTRA))
+        P[:STATES, :STATES] = self.prior
+        P[range(STATES, STATES + EXTRA), range(STATES, STATES + EXTRA)] = self.model.prior
+        return P
+
+    def step_noise(self, k: int) -> Float:
+        """Return the variances of the noise of all errors from epoch k to the next, shape (R, 14)."""
+        Q = np.zeros((self.runs, STATES + EXTRA))
+        Q[:, :STATES] = process_noise(self.grade, self.period)
+        Q[:, STATES + 1] = self.model.prior[1] * (1.0 - self.decay[:, k] ** 2)
+        return Q
 
     def part(self, rows: Int, first: int, last: int) -> Scenario:
         """Return epochs `first` to `last` - 1 of some runs."""
@@ -137,6 +186,9 @@ def independent_prior(grade: InsGrade, initial: float) -> Float:
     return np.diag(sigma**2)
 
 
+NOTHING = Disturbance()
+"""No disturbance."""
+
 Prior = Literal["independent", "tied"]
 
 
@@ -151,6 +203,8 @@ def simulate(
     noise: float = 1.0,
     initial: float = 2000.0,
     prior: Prior = "independent",
+    disturbance: Disturbance = NOTHING,
+    corrected: bool = False,
 ) -> Scenario:
     """Return simulated runs: each draws its own INS errors and its own gravimeter noise.
 
@@ -160,6 +214,8 @@ def simulate(
         runs: their numbers; seed: of all random numbers.
         period: between measurements, whole seconds; noise: sigma, mGal; initial: see `Scenario`.
         prior: how the INS errors begin, see `voyage`.
+        disturbance: of the measurements, which the filters are not told.
+        corrected: the Eoetvoes effect is computed from the velocity of the INS, and the filters know.
     """
     every = round(period)
     start = plan.trajectory().at(slice(plan.start, plan.start + 1)).latitude
@@ -180,140 +236,22 @@ def simulate(
     )
     meridian, parallel = metres_per_radian(ins.latitude)
     error = np.stack([x[:, :, 0] * meridian, x[:, :, 1] * parallel], axis=-1)
-    measured = _measure(gravity_map, true, noise, runs, seed)
+    measured = measure(gravity_map, true, noise, runs, seed)
+    measured += disturbance.added(true.latitude, true.longitude, true.seconds, gravity_map, seed)
+    if corrected or disturbance.eotvos:
+        measured += eotvos(ins.latitude, ins.east, ins.north) - eotvos(true.latitude, true.east, true.north)
     # The INS knows its heading to within the azimuth error, a milliradian.
-    return Scenario(gravity_map, grade, noise, initial, ins, measured, told, error, true, true.turns())
+    turns = true.turns()
+    return Scenario(
+        gravity_map, grade, noise, initial, ins, measured, told, error, true, turns,
+        models=(NoiseModel(eotvos=corrected),),
+    )  # fmt: skip
 
 
-def _measure(gravity_map: GravityMap, true: Trajectory, noise: float, runs: range, seed: int) -> Float:
+def measure(gravity_map: GravityMap, true: Trajectory, noise: float, runs: range, seed: int) -> Float:
     """Return measured anomalies, shape (R, K): the map along the true trajectory plus the noise of the gravimeter."""
     drawn = Streams(seed, runs, Purpose.GRAVIMETER).normal(1, len(true.seconds))[:, 0]
     return gravity_map.at(true.latitude, true.longitude) + noise * drawn
-
-
-NEEDED = ("time", "latitude", "longitude")
-OPTIONAL = ("gravity", "east", "north", "heading", "true_latitude", "true_longitude")
-GAP = 1.5
-"""Times the usual step between rows."""
-
-
-def read_voyage(path: str, period: float) -> dict[str, Float]:
-    """Return the columns of a recorded voyage at the epochs of a period in s: shape (K,), angles in degrees.
-
-    Raises:
-        DataError: unreadable, a column missing, a gap in time, a step between rows that does not divide the period, or
-            less than a period from first to last row.
-    """
-    table, lines = _read_columns(path)
-    seconds = table["time"]
-    steps = np.diff(seconds)
-    if len(seconds) < 3 or not (steps > 0).all():
-        raise DataError(f"{path}: expected at least three rows with ascending time")
-    usual = float(np.median(steps))
-    late = np.flatnonzero(steps > GAP * usual)
-    if late.size:
-        first = int(late[0])
-        raise DataError(
-            f"{path}, line {lines[first + 1]}: a gap of {steps[first]:g} s in the voyage (rows are {usual:g} s apart); "
-            "cut the file there, or fill the gap with rows of empty gravity"
-        )
-    stride = round(period / usual)
-    if stride < 1 or abs(stride * usual - period) > 0.01 * period:
-        raise DataError(f"{path}: rows are {usual:g} s apart; --period {period:g} is not a multiple of that")
-    if len(seconds) <= stride:
-        raise DataError(
-            f"{path}: {len(seconds)} rows, {usual:g} s apart, hold one measurement at --period {period:g}; expected two"
-        )
-    return {name: values[::stride] for name, values in table.items()}
-
-
-def _read_columns(path: str) -> tuple[dict[str, Float], list[int]]:
-    """Return the columns of a file and the line of each row."""
-    rows, lines = [], []
-    try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            header = [name.strip().lower() for name in next(reader, [])]
-            _check_header(path, header)
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    rows.append(_numbers(f"{path}, line {reader.line_num}", header, cells))
-                    lines.append(reader.line_num)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read: {error}") from None
-    if not rows:
-        raise DataError(f"{path}: holds no rows")
-    values = np.array(rows)
-    return {name: values[:, i] for i, name in enumerate(header) if name in NEEDED + OPTIONAL}, lines
-
-
-def _check_header(path: str, header: list[str]) -> None:
-    for name in NEEDED:
-        if name not in header:
-            raise DataError(f'{path}, line 1: no column "{name}"{did_you_mean(name, header)}')
-    if "gravity" not in header and not {"true_latitude", "true_longitude"} <= set(header):
-        raise DataError(
-            f'{path}, line 1: expected a column "gravity", or the true trajectory to simulate it from'
-        )
-
-
-def _numbers(where: str, header: list[str], cells: list[str]) -> list[float]:
-    """Return the numbers of one row; NaN for empty gravity and in columns that are not used."""
-    if len(cells) != len(header):
-        raise DataError(f"{where}: expected {len(header)} cells, not {len(cells)}")
-    values = []
-    for name, cell in zip(header, cells, strict=True):
-        value, empty = math.nan, name == "gravity" and not cell.strip()
-        if name in NEEDED + OPTIONAL and not empty:
-            try:
-                value = float(cell)
-            except ValueError:
-                raise DataError(f'{where}, column "{name}": {cell!r} is not a number') from None
-            if not (math.isfinite(value) or (name == "gravity" and math.isnan(value))):
-                raise DataError(f'{where}, column "{name}": {cell!r} is not a finite number')
-        values.append(value)
-    return values
-
-
-def from_recording(
-    columns: dict[str, Float],
-    gravity_map: GravityMap,
-    grade: InsGrade,
-    *,
-    runs: range,
-    seed: int,
-    noise: float,
-    initial: float,
-) -> Scenario:
-    """Return the scenario of a recorded voyage; gravity that was not recorded is simulated on the true trajectory."""
-    shape = len(runs), len(columns["time"])
-    indicated = true = _trajectory(columns, "latitude", "longitude")
-    if "east" in columns and "north" in columns:
-        indicated = true = replace(indicated, east=columns["east"], north=columns["north"])
-    error = None
-    if "true_latitude" in columns and "true_longitude" in columns:
-        true = _trajectory(columns, "true_latitude", "true_longitude")
-        meridian, parallel = metres_per_radian(indicated.latitude)
-        north, east = indicated.latitude - true.latitude, indicated.longitude - true.longitude
-        error = np.broadcast_to(np.stack([north * meridian, east * parallel], axis=-1), (*shape, 2))
-    measured = (
-        np.broadcast_to(columns["gravity"], shape)
-        if "gravity" in columns
-        else _measure(gravity_map, true, noise, runs, seed)
-    )
-    turns = wrap_angle(np.diff(np.radians(columns["heading"]))) if "heading" in columns else indicated.turns()
-    parts = (indicated.latitude, indicated.longitude, indicated.east, indicated.north)
-    ins = Trajectory(columns["time"], *(np.broadcast_to(part, shape) for part in parts))
-    prior = independent_prior(grade, initial)
-    return Scenario(gravity_map, grade, noise, initial, ins, measured, prior, error, true, turns)
-
-
-def _trajectory(columns: dict[str, Float], north: str, east: str) -> Trajectory:
-    """Return the trajectory of two columns, with velocities from the differences of its positions."""
-    seconds, latitude, longitude = columns["time"], np.radians(columns[north]), np.radians(columns[east])
-    meridian, parallel = metres_per_radian(latitude)
-    velocity = np.gradient(longitude, seconds) * parallel, np.gradient(latitude, seconds) * meridian
-    return Trajectory(seconds, latitude, longitude, *velocity)
 
 
 DIRECTIONS = 8

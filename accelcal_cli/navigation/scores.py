@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
+from accelcal_cli.navigation.filter import PositionEstimates
 from accelcal_cli.navigation.ins import metres_per_radian, process_noise
-from accelcal_cli.navigation.particle_filter import PositionEstimates
 from accelcal_cli.navigation.scenario import Scenario
-from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR
+from accelcal_cli.notices import Notice
 
-SETTLED = 3.0
-"""Hour of the voyage from which errors count [depf2015] section 4."""
+SETTLED = 3600.0
+"""Time from the filter's start from which errors count, s: hour 3 of a voyage whose filter starts at hour 2
+[depf2015] section 4."""
 
 ASTRAY = 0.1
 """A run whose error exceeds the initial one for more than this part of the time has lost lock."""
@@ -29,13 +30,16 @@ DIVERGED = 5.0
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of R runs over the epochs from hour 3 to the end; NaN where the true position is not known.
+    """Scores of R runs over the epochs from an hour after the filter's start; NaN where the true position is not known.
 
     Attributes:
         error: estimated - true position error of the INS, m north and east, shape (R, K, 2).
         north, east, ins: mean squares of the error and of the INS alone, m^2, shape (R,).
         nees: mean normalised error squared, 2 when the covariance is right, shape (R,).
         sigma: root of the mean claimed variance, m, shape (R,).
+        nis: mean normalised innovation squared of all epochs, 1 when innovations are as predicted, shape (R,).
+        rejected: part of the measurements that were left out as outliers; disturbed: mean probability of the disturbed
+            noise models; shape (R,).
         lost: error above the initial one at the end, or for a tenth of the time; diverged: far above it at the end.
     """
 
@@ -45,13 +49,16 @@ class Scores:
     ins: Float
     nees: Float
     sigma: Float
+    nis: Float
+    rejected: Float
+    disturbed: Float
     lost: Bool
     diverged: Bool
 
 
 def counted(scenario: Scenario) -> Bool:
-    """Return which epochs count, shape (K,): those from hour 3 on, or all if the voyage ends before."""
-    late: Bool = scenario.seconds >= SETTLED * SECONDS_PER_HOUR
+    """Return which epochs count, shape (K,): from an hour after the first on, or all if the voyage ends before."""
+    late: Bool = scenario.seconds - scenario.seconds[0] >= SETTLED
     return late if late.any() else np.ones_like(late)
 
 
@@ -70,6 +77,8 @@ def score(scenario: Scenario, estimates: PositionEstimates) -> Scores:
         lost = lost | astray[:, -1] | (astray.mean(axis=1) > ASTRAY)
         far = np.square(error[:, -1]).sum(axis=1)
         diverged = lost & ~(far <= (DIVERGED * scenario.initial) ** 2)
+    measured = np.isfinite(estimates.nis)
+    count = np.maximum(measured.sum(axis=1), 1)
     return Scores(
         error,
         square[..., 0].mean(axis=1),
@@ -77,6 +86,9 @@ def score(scenario: Scenario, estimates: PositionEstimates) -> Scores:
         ins,
         _nees(error[:, late], estimates.covariance[:, late]),
         np.sqrt(variance),
+        np.where(measured, estimates.nis, 0.0).sum(axis=1) / count,
+        estimates.rejected.sum(axis=1) / count,
+        estimates.disturbed[:, late].mean(axis=1),
         lost,
         diverged,
     )
@@ -109,3 +121,42 @@ def bound(scenario: Scenario) -> Float:
         out[k] = P[0, 0], P[1, 1]
         P = F[k] @ P @ F[k].T + Q
     return out
+
+
+CONFIDENCE, SLACK = 3.0, 0.1
+"""Of the band of the mean NIS: sigma of chance, and what the approximations of a filter add to it."""
+
+OUTLIERS, DOUBT = 0.01, 0.9
+"""Parts of the measurements that may be left out, and of the time that a disturbed noise model may be the likelier."""
+
+
+def nis_band(count: int) -> tuple[float, float]:
+    """Return the band of the mean of `count` normalised innovations squared of a filter that is right."""
+    half = SLACK + CONFIDENCE * (2.0 / max(count, 1)) ** 0.5
+    return max(0.0, 1.0 - half), 1.0 + half
+
+
+def judge(
+    nis: float, rejected: float, disturbed: float, claimed: float, initial: float, count: int
+) -> list[Notice]:
+    """Return what innovations say against a filter's estimates, of a voyage whose true track nobody needs to know.
+
+    Args:
+        nis, rejected, disturbed: see `Scores`; claimed: sigma, m; initial: m; count: of the measurements.
+    """
+    band = nis_band(count)
+    found = []
+    check = "Check the map, the clock of the gravimeter and its unit."
+    if not nis <= band[1]:
+        text = f"Innovations do not fit: NIS is {nis:.3g}, expected {band[0]:.2f} to {band[1]:.2f}."
+        found.append(Notice("nis", "warning", text, check))
+    if rejected > OUTLIERS:
+        text = f"{100.0 * rejected:.2g} % of the measurements were left out as outliers."
+        found.append(Notice("outliers", "warning", text, check))
+    if disturbed > DOUBT:
+        text = "Gravity fits the map only with a bias of the gravimeter or an error of the map."
+        found.append(Notice("disturbed", "note", text))
+    if not claimed <= initial:
+        text = f"The position is not fixed: claimed sigma is {claimed:.0f} m, initial error {initial:.0f} m."
+        found.append(Notice("fix", "warning", text, "Use a map with more relief, or a longer voyage."))
+    return found

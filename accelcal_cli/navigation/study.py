@@ -19,12 +19,16 @@ import numpy as np
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, DataError, did_you_mean
-from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, digest, generate, load_map
+from accelcal_cli.navigation.filter import FILTERS, Filter, PositionEstimates
+from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, generate
 from accelcal_cli.navigation.ins import METRES_PER_MICRO_G, InsGrade, metres_per_radian
-from accelcal_cli.navigation.particle_filter import FILTERS, Filter, PositionEstimates
-from accelcal_cli.navigation.scenario import Scenario, check_coverage, from_recording, read_voyage, simulate
-from accelcal_cli.navigation.scores import SETTLED, Scores, bound, counted, score
-from accelcal_cli.navigation.voyage import SECONDS_PER_HOUR, PlannedVoyage
+from accelcal_cli.navigation.map_files import digest, load_map
+from accelcal_cli.navigation.noise import Disturbance, noise_models
+from accelcal_cli.navigation.recording import from_recording, read_voyage
+from accelcal_cli.navigation.scenario import Scenario, check_coverage, simulate
+from accelcal_cli.navigation.scores import SETTLED, Scores, bound, counted, judge, nis_band, score
+from accelcal_cli.navigation.voyage import PlannedVoyage
+from accelcal_cli.notices import Notice, are_serious, in_one
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.schema import check, from_mapping, setting
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
@@ -65,8 +69,14 @@ class FilterEntry:
 
 def filter_names() -> list[str]:
     """Return the names of all filters, in the order of the tables."""
-    order = ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
+    order = ["pf", "pso-pf", "apo-pf", "de-pf", "mpf", "point-mass", "sitan", "reference"]
     return sorted(FILTERS.names(), key=lambda name: order.index(name) if name in order else len(order))
+
+
+DEFAULT_SET = ("de-pf", "point-mass")
+"""Filters that run when none is named: those whose claims hold on disturbed records."""
+
+Effect = Literal["none", "corrected", "included"]
 
 
 @dataclass(frozen=True)
@@ -79,8 +89,9 @@ class NavigationSettings:
     """
 
     map: str = setting(
-        "rough", "rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, XYZ text"
+        "rough", "rough, moderate or constant (generated), or a file: NetCDF, GeoTIFF, ICGEM grid, XYZ text"
     )
+    variable: str = setting("", "of a NetCDF map with several")
     map_seed: int | None = setting(None, "of a generated map; not set: the study's seed", low=0)
     voyage: str = setting("", "CSV file of a recorded voyage; without one the voyage is planned")
     plan: PlannedVoyage = setting(PlannedVoyage(), "the planned voyage")
@@ -94,6 +105,20 @@ class NavigationSettings:
         "independent",
         "initial errors: drawn one by one from what the filters are told, or tied by alignment and the hours before",
     )
+    bias: float = setting(
+        10.0, "sigma of the gravimeter's bias in the disturbed noise models, mGal", low=0.0, high=1000.0
+    )
+    map_error: float | None = setting(
+        None, "sigma of the map's error in them, mGal; not set: a part of the map's own", low=0.0, high=1000.0
+    )
+    map_length: float | None = setting(
+        None, "correlation length of that error, km; not set: the map's own", above=0.0, high=1000.0
+    )
+    gate: float = setting(5.0, "innovations beyond so many sigma are left out; 0: none", low=0.0, high=1000.0)
+    eotvos: Effect = setting(
+        "none", "Eotvos effect in the gravity: none, corrected by the velocity of the INS, or included"
+    )
+    disturbance: Disturbance = setting(Disturbance(), "of simulated gravity, which the filters are not told")
     runs: int = setting(20, "runs of each filter", low=1, high=100_000)
     seed: int = setting(0, "seed of all random numbers", low=0)
     filters: tuple[FilterEntry, ...] = ()
@@ -138,7 +163,7 @@ class NavigationSettings:
     def gravity_map(self) -> GravityMap:
         """Return the map. Raises DataError when its file cannot be used."""
         if self.map not in PRESETS:
-            return load_map(self.map)
+            return load_map(self.map, self.variable)
         return generate(PRESETS[self.map], self.seed if self.map_seed is None else self.map_seed, self.map)
 
     def scenario(self, grade: InsGrade, runs: range) -> Scenario:
@@ -147,19 +172,42 @@ class NavigationSettings:
         Raises:
             DataError: a file that cannot be used, or a map that ends near the trajectory.
         """
-        gravity_map, seed, noise, initial = self.gravity_map(), self.seed, self.noise, self.initial
+        scenario = self._recorded(grade, runs) if self.voyage else self._simulated(grade, runs)
         if not self.voyage:
-            check_coverage(gravity_map, self.plan.trajectory(), initial)
-            return simulate(
-                gravity_map, self.plan, grade, runs=runs, seed=seed, period=self.period, noise=noise, initial=initial,
-                prior=self.prior,
-            )  # fmt: skip
-        columns = read_voyage(self.voyage, self.period)
-        recorded = from_recording(
-            columns, gravity_map, grade, runs=runs, seed=seed, noise=noise, initial=initial
+            check_coverage(scenario.gravity_map, self.plan.trajectory(), self.initial)
+        else:
+            check_coverage(scenario.gravity_map, scenario.true, self.initial)
+        models = noise_models(
+            scenario.gravity_map, self.bias, self.map_error, self.map_length, self.gate, self.eotvos != "none"
         )
-        check_coverage(gravity_map, recorded.true, initial)
-        return recorded
+        return replace(scenario, models=models)
+
+    def _simulated(self, grade: InsGrade, runs: range) -> Scenario:
+        return simulate(
+            self.gravity_map(),
+            self.plan,
+            grade,
+            runs=runs,
+            seed=self.seed,
+            period=self.period,
+            noise=self.noise,
+            initial=self.initial,
+            prior=self.prior,
+            disturbance=self.disturbance,
+            corrected=self.eotvos != "none",
+        )
+
+    def _recorded(self, grade: InsGrade, runs: range) -> Scenario:
+        return from_recording(
+            read_voyage(self.voyage, self.period),
+            self.gravity_map(),
+            grade,
+            runs=runs,
+            seed=self.seed,
+            noise=self.noise,
+            initial=self.initial,
+            effect=self.eotvos,
+        )
 
 
 def load_study(path: Path | str | None, stated: Mapping[str, Any]) -> NavigationSettings:
@@ -263,6 +311,10 @@ def _record(
         "mean_square_ins": scores.ins[i],
         "nees": scores.nees[i],
         "sigma_m": scores.sigma[i],
+        "nis": scores.nis[i],
+        "rejected": scores.rejected[i],
+        "disturbed": scores.disturbed[i],
+        "measured": float(np.isfinite(estimates.nis[i]).sum()),
         "blind": estimates.blind[i],
         "lookups": estimates.lookups,
     }
@@ -317,31 +369,43 @@ def axis_of(record: Record, axis: str) -> dict[int, float]:
 
 
 def statistics(study: Navigation, records: Sequence[Record]) -> list[Row]:
-    """Return one row per cell: errors over hours 3 to 8 in m, bound, lost runs, consistency, time.
+    """Return one row per cell: errors from an hour after the filter's start in m, bound, lost runs, consistency, time.
 
     Definition:
         rmse_position_m, rmse_latitude_m, rmse_longitude_m: root mean square errors; ins_m: of the INS alone.
         circular_95_m: radius that holds 95 % of the position errors.
-        bound_m: root of the mean bound on the squared position error; bound_ratio: RMSE over it.
+        bound_m: root of the mean bound on the squared position error; bound_ratio: RMSE over it; None without a true
+            track.
+        claimed_m: root of the mean variance that the filter claims.
+        nis: mean normalised innovation squared; nis_band: where chance leaves that of a run.
+        warnings: what speaks against it.
         lost, diverged: numbers of runs; nees: mean normalised error squared; lookups: of the map, per run and epoch.
         seconds: time of all runs, s; epoch_us: of one run and epoch, microseconds.
     """
-    scenarios = (study.settings.scenario(grade, range(1)) for grade in study.grades)
-    bounds = [float(np.sqrt(bound(s)[counted(s)].sum(axis=1).mean())) for s in scenarios]
+    scenarios = [study.settings.scenario(grade, range(1)) for grade in study.grades]
     return [
-        _row(study, cell, records_of_cell(records, cell), bounds[cell // len(study.entries)])
+        _row(study, cell, records_of_cell(records, cell), scenarios[cell // len(study.entries)])
         for cell in range(study.cells)
     ]
 
 
-def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) -> Row:
-    """Return the statistics of one cell; least: its bound, m."""
+def _bound(scenario: Scenario) -> float | None:
+    """Return the bound on the position error of a scenario, m; None where the true track is not known."""
+    if scenario.error is None:
+        return None
+    return float(np.sqrt(bound(scenario)[counted(scenario)].sum(axis=1).mean()))
+
+
+def _row(study: Navigation, cell: int, records: Sequence[Record], scenario: Scenario) -> Row:
+    """Return the statistics of one cell; scenario: of one run."""
+    least, known = _bound(scenario), scenario.error is not None
     entry, grade = study.part(cell)
-    north, east, ins, nees, lookups = (
-        _mean(record.values[name] for record in records)
-        for name in ("mean_square_latitude", "mean_square_longitude", "mean_square_ins", "nees", "lookups")
+    names = ("mean_square_latitude", "mean_square_longitude", "mean_square_ins", "nees", "lookups", "nis")
+    north, east, ins, nees, lookups, nis = (
+        _mean(record.values[name] for record in records) for name in names
     )
     position = float(np.sqrt(north + east))
+    measured = round(_mean(record.values["measured"] for record in records))
     seconds = sum(record.seconds for record in records)
     return {
         "filter": entry.name,
@@ -353,15 +417,41 @@ def _row(study: Navigation, cell: int, records: Sequence[Record], least: float) 
         "rmse_longitude_m": float(np.sqrt(east)),
         "circular_95_m": _circular_95(records),
         "bound_m": least,
-        "bound_ratio": position / least,
+        "bound_ratio": None if least is None else position / least,
+        "claimed_m": _claimed(records),
+        "nis": nis,
+        "nis_band": "{:.2f} to {:.2f}".format(*nis_band(measured)),
         "ins_m": float(np.sqrt(ins)),
-        "lost": sum(record.status != "kept" for record in records),
-        "diverged": sum(record.status == "diverged" for record in records),
+        "lost": sum(record.status != "kept" for record in records) if known else None,
+        "diverged": sum(record.status == "diverged" for record in records) if known else None,
         "nees": nees,
         "lookups": lookups,
         "seconds": seconds,
+        "warnings": in_one([*scenario.notices, *_warnings(study, records)]),
         "epoch_us": 1e6 * seconds / sum(record.iterations for record in records),
     }
+
+
+def _claimed(records: Sequence[Record]) -> float:
+    """Return the root of the mean claimed variance, m."""
+    return float(np.sqrt(_mean(None if s is None else s**2 for s in (r.values["sigma_m"] for r in records))))
+
+
+def _warnings(study: Navigation, records: Sequence[Record]) -> list[Notice]:
+    """Return what the innovations of all runs say against a filter."""
+    nis, rejected, disturbed, measured = (
+        _mean(record.values[name] for record in records)
+        for name in ("nis", "rejected", "disturbed", "measured")
+    )
+    return judge(nis, rejected, disturbed, _claimed(records), study.settings.initial, round(measured))
+
+
+def are_suspect(study: Navigation, records: Sequence[Record]) -> bool:
+    """Whether the innovations of a recorded voyage speak against any of the filters."""
+    if not study.settings.voyage:
+        return False
+    cells = (records_of_cell(records, cell) for cell in range(study.cells))
+    return any(are_serious(_warnings(study, own)) for own in cells)
 
 
 def _mean(values: Iterable[float | None]) -> float:
@@ -370,11 +460,11 @@ def _mean(values: Iterable[float | None]) -> float:
 
 
 def _circular_95(records: Sequence[Record]) -> float:
-    """Return the radius that holds 95 % of the errors from hour 3 on, at the points of the curves, m."""
+    """Return the radius that holds 95 % of the errors from an hour after the start, at the points of the curves, m."""
     errors: list[float] = []
     for record in records:
         north, east = axis_of(record, "north"), axis_of(record, "east")
-        late = min(SETTLED * SECONDS_PER_HOUR, max(north, default=0))
+        late = min(min(north, default=0) + SETTLED, max(north, default=0))
         errors += [np.hypot(north[second], east[second]) for second in north if second >= late]
     return float(np.percentile(errors, 95)) if errors else float("nan")
 
@@ -412,9 +502,12 @@ def _limits(study: Navigation, grade: InsGrade) -> list[tuple[Any, ...]]:
     nowhere: Any = [(None, None)] * len(indicated)
     alone = nowhere if scenario.error is None else np.square(scenario.error[:, at]).mean(axis=0)
     label = "", float(f"{grade.accelerometer:.6g}")
+    limits: list[Any] = [(INS, alone, indicated)]
+    if scenario.error is not None:
+        limits.append((BOUND, bound(scenario)[at], nowhere))
     return [
         (name, *label, round(second), *_roots(*squares[k]), *places[k], None)
-        for name, squares, places in ((INS, alone, indicated), (BOUND, bound(scenario)[at], nowhere))
+        for name, squares, places in limits
         for k, second in enumerate(scenario.seconds[at])
     ]
 

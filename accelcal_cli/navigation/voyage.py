@@ -166,7 +166,7 @@ def ins_errors(
     x = (
         _aligned_errors(plan, trajectory, grade, streams, F[:start])
         if prior is None
-        else streams.normal(1, STATES)[:, 0] @ cholesky(prior).T
+        else (cholesky(prior) * streams.normal(1, STATES)).sum(axis=2)
     )[:, :, None]
     white = grade.white()
     errors = np.empty((len(streams), (len(F) - start) // every + 1, STATES))

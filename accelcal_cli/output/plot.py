@@ -339,15 +339,18 @@ def _draw_map(axes: Any, chart: Chart) -> None:
         extent=chart.edges,
         cmap="Greys",
         alpha=0.6,
-        aspect="auto",
+        aspect=1.0
+        / math.cos(math.radians(float(chart.indicated[1].mean()))),  # a kilometre is one either way
         interpolation="bilinear",
     )
     axes.figure.colorbar(picture, ax=axes, label="gravity anomaly, mGal", shrink=0.8)
-    axes.plot(*chart.truth, color="black", lw=6.0, alpha=0.25, label="true")  # a band below the lines
+    if chart.truth is not None:
+        axes.plot(*chart.truth, color="black", lw=6.0, alpha=0.25, label="true")  # a band below the lines
     axes.plot(*chart.indicated, label=INS, **LIMITS[INS])
     for cell, (label, track) in enumerate(chart.tracks.items()):
         axes.plot(*track, label=label, **line_style(cell))
-    for name, values in zip("xy", chart.truth, strict=True):
+    middle = chart.indicated if chart.truth is None else chart.truth
+    for name, values in zip("xy", middle, strict=True):
         getattr(axes, f"set_{name}lim")(values.min() - 0.12, values.max() + 0.12)
     axes.set(title="Run 0 over the map", xlabel="longitude, deg", ylabel="latitude, deg")
 

@@ -24,13 +24,17 @@ COLUMNS = (
     Column("95 %", "m", ".0f", key="circular_95_m"),
     Column("bound", "m", ".1f", key="bound_m"),
     Column("ratio", format=".2f", key="bound_ratio"),
+    Column("claimed", "m", ".1f", key="claimed_m"),
     Column("INS alone", "m", ".0f", key="ins_m"),
     Column("lost", format="d"),
     Column("diverged", format="d"),
     Column("NEES", format=".3g", key="nees"),
+    Column("NIS", format=".3g", key="nis"),
+    Column("NIS band", key="nis_band"),
     Column("look-ups", "1/epoch", ".0f", key="lookups"),
     Column("time", "s", ".1f", key="seconds"),
     Column("epoch", "us", ".0f", key="epoch_us"),
+    Column("warnings"),
 )
 
 CURVES = (
@@ -48,9 +52,23 @@ CURVES = (
 
 
 def summary(study: Navigation, records: Sequence[Record]) -> Table:
-    """Return one row per filter: errors over hours 3 to 8, bound, lost runs, consistency, time."""
+    """Return one row per filter: errors from an hour after its start, bound, lost runs, consistency, time."""
     rows = statistics(study, records)
     return table_of("Navigation", COLUMNS, rows, [_note(study, row) for row in rows if row["lost"]])
+
+
+def shown(table: Table) -> Table:
+    """Return a summary for people: without columns that nothing is known of, and its warnings as notes below."""
+    at = [column.key or column.name for column in table.columns]
+    warnings = at.index("warnings")
+    keep = [i for i in range(len(at)) if i != warnings and any(row[i] is not None for row in table.rows)]
+    said: dict[str, list[str]] = {}
+    for row in table.rows:
+        if row[warnings]:
+            said.setdefault(str(row[warnings]), []).append(str(row[0]))
+    notes = (*table.notes, *(f"{', '.join(dict.fromkeys(names))}: {text}" for text, names in said.items()))
+    columns = tuple(table.columns[i] for i in keep)
+    return Table(table.title, columns, tuple(tuple(row[i] for i in keep) for row in table.rows), notes)
 
 
 def _note(study: Navigation, row: Row) -> str:
@@ -86,14 +104,15 @@ class Chart:
 
     Attributes:
         anomaly: of the map, mGal, rows from south to north; edges: west, east, south, north of it.
-        truth, indicated: longitudes and latitudes of the voyage and of the INS of run 0, shape (2, T).
+        truth, indicated: longitudes and latitudes of the voyage and of the INS of run 0, shape (2, T); truth is None
+            where it is not known.
         tracks: corrected track of run 0 by each filter, by its label in the legend, shape (2, k).
         curves: RMSE against time, see `curves`.
     """
 
     anomaly: Float
     edges: Float
-    truth: Float
+    truth: Float | None
     indicated: Float
     tracks: dict[str, Float]
     curves: Table
@@ -111,7 +130,7 @@ def chart_of(study: Navigation, records: Sequence[Record], curves: Table) -> Cha
     return Chart(
         grid.values,
         np.degrees([grid.west, grid.east, grid.south, grid.north]),
-        np.degrees([true.longitude, true.latitude]),
+        None if scenario.error is None else np.degrees([true.longitude, true.latitude]),
         np.degrees([ins.longitude[0], ins.latitude[0]]),
         tracks,
         curves,

@@ -117,7 +117,7 @@ def test_a_bag_without_its_extra_is_one_line(run, held, monkeypatch):
     outcome = run("detect", "a.bag")
     assert outcome.code == 2
     assert outcome.err == (
-        "accelcal: a.bag: is a ROS 1 bag; to read it, install rosbags: pip install 'accelcal[ros]'\n"
+        "accelcal: a.bag: is a ROS 1 bag; to read it, install the extra ros: python -m pip install rosbags\n"
     )
 
 

@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,17 @@ import pytest
 
 import accelcal_cli
 from accelcal_cli.errors import AccelcalError, DataError
-from accelcal_cli.navigation.gravity_map import PRESETS, RandomField, generate, load_map
+from accelcal_cli.navigation.filter import FILTERS
+from accelcal_cli.navigation.gravity_map import PRESETS, GravityMap, RandomField, generate
 from accelcal_cli.navigation.ins import InsGrade
-from accelcal_cli.navigation.particle_filter import FILTERS
-from accelcal_cli.navigation.scenario import from_recording, read_voyage
-from accelcal_cli.navigation.study import NavigationSettings, load_study
+from accelcal_cli.navigation.map_files import load_map
+from accelcal_cli.navigation.recording import from_recording, read_voyage
+from accelcal_cli.navigation.scenario import simulate
+from accelcal_cli.navigation.study import FilterEntry, Navigation, NavigationSettings, load_study
 from accelcal_cli.navigation.voyage import PlannedVoyage
+from accelcal_cli.studies.study import Task
 from accelcal_cli.views.blocks import Table
-from accelcal_cli.views.navigation import COLUMNS, with_paper
+from accelcal_cli.views.navigation import COLUMNS, chart_of, curves, with_paper
 
 ROOT = Path(accelcal_cli.__file__).parents[1]
 SMALL = RandomField(60.0, 8.0, 20.0, 20.7, 115.0, 116.4, 60.0)
@@ -82,6 +86,7 @@ def test_xyz_text_is_read_back(tmp_path):
         ("0 0 1\n0 1 1\n1 0 1\n1 1 1\n3 0 1\n3 1 1\n", "not evenly spaced"),
         ("0 0 1\n1 0 1\n", "two nodes in latitude"),
         ("0 0 1\n0 5000 1\n1 0 1\n1 5000 1\n", "degrees"),
+        ("0 0 1\n0 1 -9999\n1 0 1\n1 1 1\n", "-9999 mGal at 1 N 0 E is no gravity anomaly"),
     ],
 )
 def test_a_bad_map_is_refused(tmp_path, text, told):
@@ -118,7 +123,55 @@ def test_netcdf_is_read(tmp_path):
     assert (read.south, read.west) == pytest.approx((grid.south, grid.west), abs=1e-12)
     both = as_array(grid).to_dataset(name="anomaly")
     both.assign(error=both.anomaly).to_netcdf(path)
-    with pytest.raises(DataError, match="one variable on a grid, not 2"):
+    with pytest.raises(
+        DataError, match=r"one variable on a grid, not 2 .anomaly, error.; state it by --variable NAME"
+    ):
+        load_map(str(path))
+    np.testing.assert_allclose(load_map(str(path), "error").values, grid.values, atol=1e-9)
+    with pytest.raises(DataError, match=r'no variable "anomly" on a grid .did you mean "anomaly"'):
+        load_map(str(path), "anomly")
+
+
+@maps
+def test_the_unit_of_a_netcdf_map_is_read(tmp_path):
+    grid = generate(SMALL, 0)
+    path = tmp_path / "map.nc"
+    for unit, factor in (("m/s^2", 1e-5), ("m s-2", 1e-5), ("mGal", 1.0), ("milligals", 1.0)):
+        array = as_array(grid) * factor
+        array.attrs["units"] = unit
+        array.to_dataset(name="anomaly").to_netcdf(path)
+        np.testing.assert_allclose(load_map(str(path)).values, grid.values, atol=1e-9)
+    array.attrs["units"] = "metres"
+    array.to_dataset(name="height").to_netcdf(path)
+    with pytest.raises(
+        DataError, match="the values are in 'metres'; expected a gravity anomaly in mGal or m/s"
+    ):
+        load_map(str(path))
+
+
+ICGEM = """product_type                gravity_field
+modelname                   EIGEN-6C4
+functional                  gravity_anomaly_cl
+unit                        {unit}
+gapvalue                    9999.0000
+     longitude      latitude   gravity_anomaly_cl
+       [deg.]        [deg.]         [{unit}]
+end_of_head ==========================================
+"""
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mgal", 1.0), ("m/s**2", 1e-5)])
+def test_an_icgem_grid_is_read(tmp_path, unit, factor):
+    path = tmp_path / "map.gdf"
+    rows = [(x, y, 10.0 * y + x - 359.0) for y in (1.0, 0.5, 0.0) for x in (359.0, 359.5, 360.0)]
+    text = "".join(f"{x:12.4f} {y:10.4f} {0.0:8.3f} {v * factor:16.9f}\n" for x, y, v in rows[:-1])
+    path.write_text(ICGEM.format(unit=unit) + text + "360.0 0.0 0.0 9999.0000\n")
+    found = load_map(str(path))
+    assert np.degrees([found.south, found.west]) == pytest.approx([0.0, 359.0])
+    np.testing.assert_allclose(found.values[1], [5.0, 5.5, 6.0], atol=1e-3)
+    assert np.isnan(found.values[0, 2])
+    path.write_text("no header\n")
+    with pytest.raises(DataError, match="whose header ends with"):
         load_map(str(path))
 
 
@@ -178,17 +231,140 @@ def voyage_rows(rows=240, period=30.0, gravity=True):
     return lines
 
 
-def test_a_recorded_voyage_with_a_gap_is_refused(tmp_path):
+def test_a_gap_is_bridged_and_told(tmp_path):
     lines = voyage_rows()
     path = tmp_path / "log.csv"
     path.write_text("\n".join(lines[:50] + lines[60:]))
-    with pytest.raises(DataError, match="line 51: a gap of 330 s"):
+    found = read_voyage(str(path), 30.0)
+    whole = tmp_path / "whole.csv"
+    whole.write_text("\n".join(lines))
+    expected = read_voyage(str(whole), 30.0)
+    np.testing.assert_allclose(found.columns["longitude"], expected.columns["longitude"], atol=1e-9)
+    assert np.flatnonzero(np.isnan(found.columns["gravity"])).tolist() == list(range(49, 59))
+    assert "1 gap in the record, the longest of 330 s at line 51" in str(found.notices[0])
+    assert expected.notices == ()
+
+
+def test_too_long_a_gap_is_refused(tmp_path):
+    lines = voyage_rows()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines[:50] + lines[180:]))
+    with pytest.raises(DataError, match=r"line 51: a gap of 3930 s.*cut the file there"):
         read_voyage(str(path), 30.0)
+
+
+def columns_of(tmp_path, lines, period=30.0):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines))
+    return read_voyage(str(path), period).columns
+
+
+def test_times_count_from_the_first_row_however_they_are_written(tmp_path):
+    lines = voyage_rows()
+    expected = columns_of(tmp_path, lines)
+    assert expected["time"][0] == 0.0
+    header, *rows = lines
+    cells = [row.split(",", 1) for row in rows]
+    later = [f"{float(t) + 1.7e9},{rest}" for t, rest in cells]
+    stamps = [
+        f"{datetime.fromtimestamp(float(t), UTC).isoformat().replace('+00:00', 'Z')},{rest}"
+        for t, rest in cells
+    ]
+    for written in (later, stamps):
+        found = columns_of(tmp_path, [header, *written])
+        for name, values in expected.items():
+            np.testing.assert_allclose(found[name], values, atol=1e-6)
+
+
+def test_rows_need_not_be_quite_regular(tmp_path):
+    header, *rows = voyage_rows()
+    shaken = [
+        f"{float(t) + (-1) ** i:.1f},{rest}" for i, (t, rest) in enumerate(row.split(",", 1) for row in rows)
+    ]
+    found = columns_of(tmp_path, [header, *shaken])
+    assert np.isfinite(found["gravity"]).all()
+    assert len(found["time"]) == 240
+
+
+@pytest.mark.parametrize("turn", [0.0, 360.0, -360.0])
+def test_longitudes_of_0_to_360_are_those_of_the_map(tmp_path, rough, turn):
+    header, *rows = voyage_rows()
+    moved = []
+    for row in rows:
+        cells = row.split(",")
+        cells[2], cells[4] = (
+            f"{float(cells[i]) + turn * (abs(float(cells[i]) + turn) <= 360):.8f}" for i in (2, 4)
+        )
+        moved.append(",".join(cells))
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([header, *moved]))
+    found = recorded(path, rough)
+    assert np.isfinite(found.gravity_map.at(found.true.latitude, found.true.longitude)).all()
+
+
+def recorded(path, grid):
+    return from_recording(
+        read_voyage(str(path), 30.0), grid, InsGrade(), runs=range(1), seed=0, noise=1.0, initial=2000.0
+    )
+
+
+def test_a_voyage_and_a_map_cross_the_date_line(tmp_path):
+    """The map has columns from 179 to 181 degrees, written as 179, ..., 180, -179.9, ...; so has the voyage."""
+    longitude = np.arange(1790, 1811) / 10.0
+    wrapped = np.where(longitude > 180.0, longitude - 360.0, longitude)
+    lines = [
+        f"{x} {y} {10 * y + e}"
+        for y in (20.0, 20.1, 20.2, 20.3)
+        for x, e in zip(wrapped, longitude, strict=True)
+    ]
+    grid = tmp_path / "map.xyz"
+    grid.write_text("\n".join(lines))
+    field = load_map(str(grid))
+    assert np.degrees([field.west, field.east]) == pytest.approx([179.0, 181.0])
+    path = tmp_path / "log.csv"
+    rows = [
+        f"{30 * i},20.15,{(x if x <= 180 else x - 360):.6f},205.0"
+        for i, x in enumerate(np.linspace(179.9, 180.1, 90))
+    ]
+    path.write_text("time,latitude,longitude,gravity\n" + "\n".join(rows))
+    found = recorded(path, field)
+    anomaly = found.anomaly(45, np.zeros((1, 1)), np.zeros((1, 1)))
+    assert anomaly[0, 0] == pytest.approx(201.5 + np.degrees(found.ins.longitude[0, 45]))
+    assert abs(found.ins.east).max() < 20.0
+
+
+def test_a_map_round_the_earth_has_no_seam(tmp_path):
+    rows, columns = 3, 36
+    values = np.arange(rows * columns, dtype=float).reshape(rows, columns)
+    grid = GravityMap(0.0, 0.0, np.radians(10.0), np.radians(10.0), values)
+    turned = grid.facing(0.0)
+    assert turned.at(np.zeros(3), np.radians(np.array([-10.0, 0.0, 10.0]))) == pytest.approx([35.0, 0.0, 1.0])
+    assert turned.at(np.zeros(1), np.radians(np.array([-5.0]))) == pytest.approx([17.5])
+    assert grid.turn_to(np.radians(-100.0)) == pytest.approx(2 * np.pi)
 
 
 @pytest.mark.parametrize(
     ("change", "told"),
     [
+        (
+            lambda s: s.replace("20.31", "95", 1),
+            'line 2, column "latitude": 95 is out of range; expected -89 to 89',
+        ),
+        (
+            lambda s: re.sub(r"115\.30400000", "1e9", s, count=1),
+            "line 2, column .*longitude.*: 1e9.* is out of range",
+        ),
+        (
+            lambda s: s.replace(",3.5", ",-9999", 1),
+            'line 2, column "gravity": -9999 is out of range.*leave the cell',
+        ),
+        (lambda s: s.replace(",3.5", ",1e30", 1), 'line 2, column "gravity": 1e30 is out of range'),
+        (lambda s: s.replace("20.31", "25.31", 1), "line 3: latitude and longitude jump by 55"),
+        (lambda s: s.replace("7230", "7200", 1), "line 3: time does not ascend"),
+        (
+            lambda s: s.replace("7230.0", "yesterday", 1),
+            "line 3, column \"time\": 'yesterday' is neither seconds nor a date",
+        ),
         (lambda s: s.replace("latitude", "latitud", 1), 'no column "latitude" \\(did you mean "latitud"'),
         (lambda s: s.replace("20.31", "north", 1), 'line 2, column "latitude"'),
         (lambda s: s.replace(",3.5", ",3.5,9", 1), "line 2: expected 6 cells"),
@@ -232,9 +408,7 @@ def test_a_recorded_heading_turns_the_biases(tmp_path):
     degrees = ("heading", "350", "10", "10", "40")
     path.write_text("\n".join(f"{line},{cell}" for line, cell in zip(lines, degrees, strict=True)))
     flat = generate(PRESETS["constant"], 0)
-    found = from_recording(
-        read_voyage(str(path), 30.0), flat, InsGrade(), runs=range(1), seed=0, noise=1.0, initial=2000.0
-    )
+    found = recorded(path, flat)
     np.testing.assert_allclose(np.degrees(found.turns), [20.0, 0.0, 30.0], atol=1e-9)
 
 
@@ -254,16 +428,21 @@ def test_the_rows_have_their_names(quick, tmp_path):
         "lost",
         "nees",
         "seconds",
+        "bound_m",
+        "nis",
+        "claimed_m",
+        "warnings",
     }
-    assert [row["filter"] for row in rows] == ["pf", "pso-pf", "apo-pf", "de-pf", "reference"]
+    names = ["pf", "pso-pf", "apo-pf", "de-pf", "mpf", "point-mass", "sitan", "reference"]
+    assert [row["filter"] for row in rows] == names
     assert all(contract <= set(row) for row in rows)
     header, *curves = out.read_text().splitlines()
     assert header.startswith("filter,mode,accelerometer_ug,seconds,rmse_latitude_m")
     named = {line.split(",")[0] for line in curves}
-    assert named == {"pf", "pso-pf", "apo-pf", "de-pf", "reference", "INS alone", "bound"}
+    assert named == {*names, "INS alone", "bound"}
     start = next(line.split(",") for line in curves if line.startswith("INS alone"))
-    assert 1000 < float(start[6]) < 1700  # the drift at the start of filtering
-    assert len(raw.read_text().splitlines()) == 11
+    assert 200 < float(start[6]) < 5000  # two draws from a sigma of 1155 m on either axis
+    assert len(raw.read_text().splitlines()) == 17
 
 
 def test_jobs_do_not_change_the_result(quick):
@@ -317,6 +496,12 @@ def test_a_calibration_changes_the_ins(quick, tmp_path, suffix):
         (("--particles", "1"), "particles"),
         (("--voyage", "nothing.csv"), "nothing.csv"),
         (("--calibration", "nothing.yaml"), "nothing.yaml"),
+        (
+            ("--calibration", "nothing.yaml", "--voyage", "log.csv"),
+            "--calibration does not apply to --voyage",
+        ),
+        (("--voyage", "log.csv", "--prior", "tied"), "prior: tied needs the hours before the first row"),
+        (("--prior", "tide"), 'did you mean "tied"'),
         (("--resume",), "--raw"),
         (("-o", "/nowhere/x.csv"), "no such folder"),
     ],
@@ -348,7 +533,9 @@ def test_a_bad_key_of_the_file_is_one_message(tmp_path, text, told):
 def test_two_measurements_are_enough_for_every_filter(tmp_path):
     path = tmp_path / "study.yaml"
     path.write_text("plan: {hours: 2.0028}\nruns: 1\nnoise: 1.0e-3\n")
-    assert len(json.loads(navigate("--config", path, "--format", "json", "-q"))) == len(FILTERS.names())
+    assert len(json.loads(navigate("--config", path, "--filter", "all", "--format", "json", "-q"))) == len(
+        FILTERS.names()
+    )
 
 
 def test_a_voyage_of_one_measurement_is_refused(tmp_path):
@@ -402,3 +589,63 @@ def test_the_papers_numbers_stand_beside_ours():
     assert [row["paper_m"] for row in table.records()] == [370.7, 101.5]
     assert study.runs == 200
     assert {entry.parameters.get("particles", 100) for entry in study.filters} == {100}
+
+
+# Recorded voyages that nobody knows the truth of
+
+
+def write_record(path, seed=1, shift=0, hours=6.0):
+    """Write what an INS and a gravimeter record on map `seed`, the gravity `shift` epochs of a minute late."""
+    grid = generate(PRESETS["rough"], seed, "rough")
+    plan = PlannedVoyage(hours=2.0 + hours)
+    sim = simulate(grid, plan, InsGrade(), runs=range(1), seed=7, period=60.0)
+    gravity = np.roll(sim.measured[0], shift)
+    ins = sim.ins
+    lines = ["time,latitude,longitude,east,north,gravity"]
+    for k, t in enumerate(sim.seconds):
+        place = np.degrees([ins.latitude[0, k], ins.longitude[0, k]])
+        lines.append(
+            f"{t},{place[0]:.9f},{place[1]:.9f},{ins.east[0, k]:.5f},{ins.north[0, k]:.5f},{gravity[k]:.3f}"
+        )
+    path.write_text("\n".join(lines))
+    return path
+
+
+def judged(path, seed, code):
+    """Return the rows that filters print of a record over map `seed`."""
+    config = path.with_suffix(".yaml")
+    config.write_text(f"map: rough\nmap_seed: {seed}\nperiod: 60\nruns: 1\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "accelcal_cli", "navigate", "--config", config, "--voyage", path,
+         "--filter", "sitan,point-mass", "--format", "json", "-q"],
+        capture_output=True, text=True, cwd=ROOT, check=False,
+    )  # fmt: skip
+    assert done.returncode == code, done.stderr + done.stdout
+    return json.loads(done.stdout)
+
+
+def test_a_record_that_fits_has_no_warning_and_no_error_to_print(tmp_path):
+    for row in judged(write_record(tmp_path / "log.csv"), 1, 0):
+        assert row["warnings"] == ""
+        assert row["nis"] == pytest.approx(1.0, abs=0.2)
+        assert 50.0 < row["claimed_m"] < 1000.0
+        assert row["rmse_position_m"] is row["bound_m"] is row["lost"] is None
+
+
+@pytest.mark.parametrize(("seed", "shift"), [(2, 0), (1, 60)])
+def test_another_map_or_a_clock_an_hour_off_is_told(tmp_path, seed, shift):
+    for row in judged(write_record(tmp_path / "log.csv", shift=shift), seed, 1):
+        assert "Check the map, the clock of the gravimeter" in row["warnings"]
+
+
+def test_a_picture_without_a_true_track_shows_none(tmp_path):
+    path = write_record(tmp_path / "log.csv", hours=1.0)
+    study = Navigation(
+        NavigationSettings(map_seed=1, voyage=str(path), period=60.0, runs=1),
+        (FilterEntry("sitan"),),
+        (InsGrade(),),
+    )
+    records = study.execute(Task(0, 0, 1))
+    table = curves(study, records)
+    assert chart_of(study, records, table).truth is None
+    assert {row["filter"] for row in table.records()} == {"sitan", "INS alone"}

@@ -93,7 +93,7 @@ def test_unknown_peers_are_explained(monkeypatch):
     with pytest.raises(ConfigError, match=r'did you mean "differential_evolution"'):
         peers.peer("scipy:diferential_evolution")
     monkeypatch.setitem(sys.modules, "pyswarms.single", None)
-    with pytest.raises(DataError, match=r"pip install 'accelcal\[bench\]'"):
+    with pytest.raises(DataError, match=r"extra bench: python -m pip install pyswarms"):
         peers.peer("pyswarms:pso")
 
 

@@ -151,7 +151,7 @@ def check_extra(module: str, extra: str, source: str, title: str) -> None:
     """Raise UsageError, naming the extra, where the module that reads a format is not installed."""
     if find_spec(module) is None:
         raise UsageError(
-            f"{source}: is {title}; to read it, install {module}: pip install 'accelcal[{extra}]'"
+            f"{source}: is {title}; to read it, install the extra {extra}: python -m pip install {module}"
         )
 
 

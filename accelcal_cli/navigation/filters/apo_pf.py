@@ -12,7 +12,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.navigation.evolution import EvolvingFilter, Fitness
-from accelcal_cli.navigation.particle_filter import FILTERS
+from accelcal_cli.navigation.filter import FILTERS
 from accelcal_cli.rng import Streams
 from accelcal_cli.schema import setting
 

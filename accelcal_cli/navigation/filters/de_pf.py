@@ -10,7 +10,7 @@ the paper's text reads. Only the first particles move, while best and worst are 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Literal
 
@@ -27,11 +27,10 @@ from accelcal_cli.navigation.evolution import (
     evolve_degenerate,
     posterior,
 )
+from accelcal_cli.navigation.filter import FILTERS, PositionEstimates
 from accelcal_cli.navigation.marginal import MarginalFilter, de_mc_generation
 from accelcal_cli.navigation.particle_filter import (
-    FILTERS,
     Cloud,
-    PositionEstimates,
     moments,
     normalise,
     systematic,
@@ -44,9 +43,9 @@ from accelcal_cli.schema import setting
 OPERATORS = ("weight_min", "weight_max", "crossover_min", "crossover_max", "mutation")
 IDLE = {
     "marginal": ("roughening", "threshold", "resampling", "state", "fraction", *OPERATORS),
-    "metropolis": ("fraction", "window", "inflation", "recovery_inflation", *OPERATORS),
-    "window": ("inflation", "recovery_inflation"),
-    "safe": ("window", "inflation", "recovery_inflation"),
+    "metropolis": ("fraction", "window", "inflation", "recovery", *OPERATORS),
+    "window": ("inflation", "recovery"),
+    "safe": ("window", "inflation", "recovery"),
 }
 """Settings that have no effect in mode default, by strategy."""
 
@@ -64,15 +63,20 @@ class DePf(EvolvingFilter):
         "form of mode default: particles for position with a Gaussian for the other errors; moves accepted by "
         "Metropolis; fitness over a window; evolution of the worst particles alone",
     )
-    window: int = setting(10, "W, measurements per window (strategies marginal and window)", low=1, high=1000)
+    window: float = setting(
+        300.0,
+        "W, of measurements that count at once, s (strategies marginal and window)",
+        above=0.0,
+        high=36000.0,
+    )
     inflation: float = setting(
         1.02,
         "of the covariance at the end of a window: corrects the moments of N particles",
         low=1.0,
         high=2.0,
     )
-    recovery_inflation: float = setting(
-        4.0, "of the covariance when no track explains a window; 1: none", low=1.0, high=100.0
+    recovery: float = setting(
+        0.1, "part of the prior that is added when no track explains a window; 0: none", low=0.0, high=10.0
     )
     weight_min: float = setting(0.4, "F of the best particle (F_min) [depf2015]", low=0.0, high=2.0)
     weight_max: float = setting(1.0, "F of the worst particle (F_max) [depf2015]", low=0.0, high=2.0)
@@ -95,22 +99,22 @@ class DePf(EvolvingFilter):
     def evolution(self) -> Evolution:
         """The strategy that the settings select; `marginal` is a filter of its own, see `run`."""
         if self.mode == "default" and self.strategy == "window":
-            return partial(evolve_degenerate, memory=self.window)
+            return partial(evolve_degenerate, span=self.window)
         if self.mode == "default" and self.strategy == "metropolis":
             return partial(evolve_degenerate, move=resample_move)
         return super().evolution
 
-    def run(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
+    def track(self, scenario: Scenario, streams: Streams) -> PositionEstimates:
         """Return the filter's estimates; see `Filter`."""
         if self.mode == "literal" or self.strategy != "marginal":
-            return super().run(scenario, streams)
+            return super().track(scenario, streams)
         return MarginalFilter(
             self.particles,
             self.generations,
-            self.window,
+            scenario.epochs_in(self.window),
             self.variance or scenario.noise**2,
             self.inflation,
-            self.recovery_inflation,
+            self.recovery,
         ).run(scenario, streams)
 
     def evolve(self, x: Float, fitness: Float, movers: int, rate: Fitness, streams: Streams) -> Float:
@@ -155,11 +159,18 @@ def resample_move(
 
     See `move_worst` for arguments and results.
     """
-    rate = CountedFitness(posterior(form, recent, *moments(prior, cloud.x[..., :2])))
-    chosen = systematic(normalise(cloud.log_weights), streams.uniform(1, 1)[:, 0, 0])
+    mean, covariance = moments(prior, cloud.x[..., :2])
+    weights = normalise(cloud.log_weights)
+    chosen = systematic(weights, streams.uniform(1, 1)[:, 0, 0])
     x = np.take_along_axis(cloud.x, chosen[:, :, None], axis=1)
-    position, level = x[..., :2], rate(x[..., :2])
+    bias = np.broadcast_to(
+        moments(weights, cloud.level)[0][:, None], cloud.level.shape
+    )  # whoever moves where
+    cloud = replace(cloud, x=x, level=bias, log_weights=np.zeros(weights.shape))
+    rate = CountedFitness(posterior(form, recent, cloud, mean, covariance))
+    position = x[..., :2].copy()
+    level = rate(position)
     for _ in range(form.generations):
         position, level = de_mc_generation(position, level, rate, streams)
     x[..., :2] = position
-    return Cloud(x, np.zeros(cloud.log_weights.shape)), rate.points
+    return cloud, rate.points

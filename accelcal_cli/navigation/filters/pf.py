@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from accelcal_cli.navigation.particle_filter import FILTERS, ParticleFilter
+from accelcal_cli.navigation.filter import FILTERS
+from accelcal_cli.navigation.particle_filter import ParticleFilter
 
 
 @FILTERS.register("pf")

@@ -8,7 +8,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.navigation.evolution import EvolvingFilter, Fitness, best_particle
-from accelcal_cli.navigation.particle_filter import FILTERS
+from accelcal_cli.navigation.filter import FILTERS
 from accelcal_cli.rng import Streams
 
 

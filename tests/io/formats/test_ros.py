@@ -88,7 +88,7 @@ def test_time_is_that_of_the_recording_where_there_are_no_stamps(tmp_path, form)
 
 def test_the_extra_is_named_where_it_is_missing(bags, monkeypatch):
     monkeypatch.setattr(base, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"is a ROS 1 bag; .* pip install 'accelcal\[ros\]'"):
+    with pytest.raises(UsageError, match=r"is a ROS 1 bag; .* extra ros: python -m pip install rosbags"):
         read(bags["rosbag1"])
 
 
