@@ -45,7 +45,9 @@ def cocoex() -> Any:
     try:
         import cocoex as module
     except ImportError:
-        raise DataError("--func bbob needs the extra bbob: python -m pip install coco-experiment cocopp six") from None
+        raise DataError(
+            "--func bbob needs the extra bbob: python -m pip install coco-experiment cocopp six"
+        ) from None
     module.log_level("warning")
     return module
 

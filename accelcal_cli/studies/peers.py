@@ -330,4 +330,6 @@ def peer(name: str) -> Search:
     try:
         return LIBRARIES[library](algorithm)
     except ImportError as error:
-        raise DataError(f"peer {name} needs the extra bench: python -m pip install {library} ({error})") from None
+        raise DataError(
+            f"peer {name} needs the extra bench: python -m pip install {library} ({error})"
+        ) from None
