@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -24,8 +25,11 @@ from accelcal_cli.calibration.observability import (
     next_poses,
     pose_score,
 )
-from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.result import RESULTS, Calibration, load_result
+from accelcal_cli.errors import UsageError, did_you_mean
+from accelcal_cli.io.readings import Data
 from accelcal_cli.rng import Purpose, Streams
+from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import fixture_directions, grid
 
 FIXTURES = ("faces", "edges", "corners", "any")
@@ -84,7 +88,74 @@ class Plan:
         return self.stages[0].verdict != "undetermined"
 
 
+FROM_NOTHING, NEXT, MOST_POSES = 12, 6, 200
+"""Poses that are planned unless a number is stated: in all, and to add to those so far; and at most."""
+
+
 def plan(
+    so_far: Calibration | str | Path | Data | None = None,
+    *,
+    poses: int | None = None,
+    add: int | None = None,
+    fixture: str = "corners",
+    noise: float | None = None,
+    g: float | None = None,
+) -> Plan:
+    """Return the poses to take next: those that shrink the worst sigma most.
+
+    Args:
+        so_far: what is known already: a calibration or its file, or readings as `calibrate` takes them; None for
+            nothing.
+        poses: number of poses in the end, those so far included; add: number to add, instead of `poses`.
+        fixture: one of FIXTURES: what the sensor can be held against.
+        noise: standard deviation of one pose, m/s^2; that of the poses so far when None.
+        g: local gravity, of readings, or in m/s^2 where nothing is known yet; that of the calibration so far otherwise.
+
+    Raises:
+        UsageError: an unknown fixture, or no number of poses to add.
+
+    Examples:
+        >>> from accelcal_cli import plan
+        >>> proposal = plan(add=12, noise=0.01)
+        >>> len(proposal.directions), proposal.verdict
+        (12, 'good')
+    """
+    if fixture not in FIXTURES:
+        raise UsageError(
+            f'--fixture "{fixture}": unknown{did_you_mean(fixture, FIXTURES)}; expected one of {", ".join(FIXTURES)}'
+        )
+    if poses is not None and add is not None:
+        raise UsageError("--poses and --add: expected one of them, not both")
+    known = _known(so_far, g)
+    existing = 0 if known is None else known.poses
+    count = add or ((poses or FROM_NOTHING) - existing if poses or known is None else NEXT)
+    if count < 1:
+        raise UsageError(f"--poses {poses}: {existing} poses exist already; expected more, or --add")
+    if count > MOST_POSES:
+        raise UsageError(f"--poses {poses}: {count} poses to plan; expected at most {MOST_POSES}")
+    if known is None:
+        part = None if noise is None else noise / (g or STANDARD_GRAVITY)
+        return plan_from(np.zeros((9, 9)), 0, count, fixture, part)
+    sigma = noise or (known.s if known.freedom > 0 else 0.0)
+    return plan_from(
+        known.information, existing, count, fixture, sigma / known.g if sigma > 0 else None, known
+    )
+
+
+def _known(so_far: Calibration | str | Path | Data | None, g: float | None) -> Calibration | None:
+    """Return the calibration of the poses so far."""
+    if so_far is None or isinstance(so_far, Calibration):
+        return so_far
+    if isinstance(so_far, str | Path) and Path(so_far).suffix in RESULTS:
+        return load_result(so_far)
+    from accelcal_cli.calibration.calibrate import calibrate
+
+    if g is None:
+        return calibrate(so_far, optimizer="levenberg-marquardt")
+    return calibrate(so_far, optimizer="levenberg-marquardt", g=g)
+
+
+def plan_from(
     information: Float,
     poses: int,
     count: int,

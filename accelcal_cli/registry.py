@@ -58,7 +58,7 @@ class Registry(Generic[T]):
         return enter
 
     def names(self) -> list[str]:
-        """Return the name of every class that can be used, sorted.
+        """Return the name of every class that can be used by name, sorted; those of `imported` cannot.
 
         Imports every module of the package and every installed class; one that fails is left out and its message
         put into `faults`, so that somebody else's broken package breaks nothing that does not use it.
@@ -71,7 +71,7 @@ class Registry(Generic[T]):
                 self.find(name)
             except ConfigError as error:
                 self.faults[name] = str(error)
-        return sorted(self._classes)
+        return sorted(name for name in self._classes if ":" not in name)
 
     def get(self, name: str) -> type[T]:
         """Return the class called `name`.

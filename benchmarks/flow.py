@@ -42,10 +42,11 @@ READERS = ("io/", "calibration/", "detection/")
 """What a benchmark of optimizers has no use for."""
 
 ENTRIES = (
+    ("calibration/calibrate.py", "_calibrated", "readings"),
     ("calibration/calibrate.py", "calibrate", "readings"),
     ("calibration/pipeline.py", "calibrate", "readings"),
 )
-"""Where the parameter that `walk` follows starts: the present place, then the first version's."""
+"""Where the parameter that `walk` follows starts: the present place, then those of earlier versions."""
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,8 @@ class Browser:
         answer = self._post("/session", {"capabilities": {"alwaysMatch": capabilities}})
         self.session = f"/session/{answer['sessionId']}"
 
-    def open(self, page: Path, *, width: int = 1100, height: int = 900, scheme: str = "light") -> None:
-        """Open a page in a window of a width, with a colour scheme preferred."""
+    def open(self, page: Path | str, *, width: int = 1100, height: int = 900, scheme: str = "light") -> None:
+        """Open a page, a file or an address, in a window of a width, with a colour scheme preferred."""
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         self.devtools("Emulation.setEmulatedMedia", features=features)
         self.devtools(
@@ -59,7 +59,7 @@ class Browser:
             deviceScaleFactor=1,
             mobile=width < 600,
         )
-        self._post(f"{self.session}/url", {"url": page.as_uri()})
+        self._post(f"{self.session}/url", {"url": page if isinstance(page, str) else page.as_uri()})
 
     def devtools(self, command: str, **parameters: Any) -> Any:
         """Run a command of the browser's developer tools."""
@@ -79,9 +79,9 @@ class Browser:
         messages = [json.loads(entry["message"])["message"] for entry in self.log("performance")]
         return [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
 
-    def screenshot(self, file: Path) -> None:
-        """Write a picture of the whole page."""
-        answer = self.devtools("Page.captureScreenshot", captureBeyondViewport=True, format="png")
+    def screenshot(self, file: Path, *, whole: bool = True) -> None:
+        """Write a picture of the whole page, or of what the window shows."""
+        answer = self.devtools("Page.captureScreenshot", captureBeyondViewport=whole, format="png")
         file.write_bytes(base64.b64decode(answer["data"]))
 
     def print(self, file: Path) -> None:

@@ -19,7 +19,7 @@ from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.algorithms.levenberg_marquardt import LevenbergMarquardt
 from accelcal_cli.optimization.minimize import minimize
-from accelcal_cli.planning import FIXTURES, PRIOR, best_poses, candidates, distinct_poses, plan
+from accelcal_cli.planning import FIXTURES, PRIOR, best_poses, candidates, distinct_poses, plan_from
 from accelcal_cli.rng import Streams
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.poses import fixture_directions
@@ -237,7 +237,7 @@ def _largest_of_kinds(u):
 @pytest.mark.parametrize("fixture", ["edges", "corners"])
 @pytest.mark.parametrize("count", [14, 16, 18, 24, 40])
 def test_enough_poses_contain_faces_and_cost_the_nine_little(count, fixture):
-    found = plan(np.zeros((9, 9)), 0, count, fixture, None)
+    found = plan_from(np.zeros((9, 9)), 0, count, fixture, None)
     assert _faces_of(found.directions) >= 1
     best = candidates(fixture)[best_poses(np.zeros((9, 9)), candidates(fixture), count)]
     assert (_largest_of_kinds(found.directions) <= 1.1 * _largest_of_kinds(best) * (1 + 1e-6)).all()
@@ -247,7 +247,7 @@ def test_enough_poses_contain_faces_and_cost_the_nine_little(count, fixture):
 
 def test_a_cubic_is_seen_as_its_dilution_says():
     """A cubic of 0.5 % on z, fitted beside the nine in simulated readings of the planned poses."""
-    found = plan(np.zeros((9, 9)), 0, 18, "corners", 1e-4)
+    found = plan_from(np.zeros((9, 9)), 0, 18, "corners", 1e-4)
     u, cubic, noise = found.directions, 0.005, 1e-4
     rows = np.concatenate([design(u), -(u**4)], axis=1)
     force = u * (1.0 + cubic * u**2 * np.array([0.0, 0.0, 1.0]))
@@ -261,7 +261,7 @@ def test_a_cubic_is_seen_as_its_dilution_says():
 
 
 def test_twelve_edges_stay_the_default_and_are_blind_to_a_cubic():
-    found = plan(np.zeros((9, 9)), 0, 12, "corners", None)
+    found = plan_from(np.zeros((9, 9)), 0, 12, "corners", None)
     assert _faces_of(found.directions) == 0
     assert np.isinf(found.cubic).all()
     assert "Cubic nonlinearity of any axis does not show" in pose_table(found).notes[-1]
@@ -269,8 +269,8 @@ def test_twelve_edges_stay_the_default_and_are_blind_to_a_cubic():
 
 
 def test_noise_that_hides_a_cubic_leaves_the_poses_to_the_nine():
-    quiet = plan(np.zeros((9, 9)), 0, 18, "edges", 1e-4)
-    noisy = plan(np.zeros((9, 9)), 0, 18, "edges", 0.01)
+    quiet = plan_from(np.zeros((9, 9)), 0, 18, "edges", 1e-4)
+    noisy = plan_from(np.zeros((9, 9)), 0, 18, "edges", 0.01)
     assert _faces_of(quiet.directions) > 0
     best = candidates("edges")[best_poses(np.zeros((9, 9)), candidates("edges"), 18)]
     assert _dop(noisy.directions).max() == pytest.approx(_dop(best).max(), rel=1e-9)
@@ -281,7 +281,7 @@ def test_faces_are_added_to_twelve_edges():
     g = 9.8
     readings = Readings.from_array(DPSO.output(g * poses.edges() + Streams(1, [0]).normal(12, 3)[0] * 1e-3))
     result = calibrate(readings, Settings(g=g, optimizer="levenberg-marquardt"))
-    found = plan(result.information, 12, 6, "corners", 1e-4, result)
+    found = plan_from(result.information, 12, 6, "corners", 1e-4, result)
     assert _faces_of(found.directions) >= 3
     assert np.isfinite(found.cubic).all()
 
@@ -289,7 +289,7 @@ def test_faces_are_added_to_twelve_edges():
 def test_predicted_sigma_is_the_scatter_of_simulated_calibrations():
     """Two thousand sensors in the six faces and the six poses that were planned."""
     g, runs, sigma = 9.8, 2000, 1e-3
-    found = plan(_information(poses.faces()), 6, 6, "corners", sigma / g)
+    found = plan_from(_information(poses.faces()), 6, 6, "corners", sigma / g)
     u = np.concatenate([poses.faces(), found.directions])
     truth = DPSO.in_gauge("lower")
     outputs = truth.output(g * u + sigma * Streams(3, range(runs)).normal(len(u), 3))
@@ -306,7 +306,7 @@ def test_predicted_sigma_is_the_scatter_of_simulated_calibrations():
 
 
 def test_a_plan_tells_what_is_expected_after_each_pose():
-    found = plan(_information(poses.faces()), 6, 6, "corners", 1e-4)
+    found = plan_from(_information(poses.faces()), 6, 6, "corners", 1e-4)
     rows = pose_table(found).records()
     assert [row["pose"] for row in rows] == list(range(6, 13))
     assert rows[0]["hold"] == "so far"
@@ -324,16 +324,16 @@ def test_a_plan_tells_what_is_expected_after_each_pose():
 
 
 def test_without_a_noise_there_is_no_sigma():
-    found = plan(np.zeros((9, 9)), 0, 12, "edges", None)
+    found = plan_from(np.zeros((9, 9)), 0, 12, "edges", None)
     assert not [key for row in pose_table(found).records() for key in row if key.startswith("sigma")]
     assert not [key for row in parameter_table(found).records() for key in row if key.startswith("sigma")]
 
 
 def test_poses_that_cannot_be_enough_are_named_as_such():
-    found = plan(np.zeros((9, 9)), 0, 12, "faces", None)
+    found = plan_from(np.zeros((9, 9)), 0, 12, "faces", None)
     assert found.verdict == "undetermined"
     assert "misalignment xy, misalignment xz, misalignment yz" in pose_table(found).notes[-1]
-    assert "all nine parameters" in pose_table(plan(np.zeros((9, 9)), 0, 1, "any", None)).notes[-1]
+    assert "all nine parameters" in pose_table(plan_from(np.zeros((9, 9)), 0, 1, "any", None)).notes[-1]
 
 
 @pytest.mark.parametrize("count", [1, 12, 20, 26])

@@ -11,21 +11,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import IO
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.known_attitudes import covariance_of_twelve
 from accelcal_cli.calibration.observability import gauge_chain
-from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.result import Calibration, load_result
 from accelcal_cli.errors import DataError, UsageError, did_you_mean
 from accelcal_cli.io.columns import Columns, choose
-from accelcal_cli.io.reader import InputTable, Selection, TextTable
+from accelcal_cli.io.reader import InputTable, Selection, TextTable, open_table
 from accelcal_cli.io.rewrite import Change, rewrite
+from accelcal_cli.io.stream import Frame, is_frame
 from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
 from accelcal_cli.sensor.poses import AXES
+
+if TYPE_CHECKING:
+    import polars
 
 UNITS = {"m/s^2": 1.0, "g": 1.0 / STANDARD_GRAVITY, "mg": 1000.0 / STANDARD_GRAVITY}
 """Units of the specific force, and how many of each are 1 m/s^2."""
@@ -78,16 +84,13 @@ class Correction:
         """Take over the model, the temperature slopes and the options."""
         own = result.unit
         self.g, self.factor = result.g, UNITS[options.unit or own] / UNITS[own]
-        self.model, self.slopes = result.model, result.temperature
+        self.result = result
         self.tilt = Tilt.of(result, options.noise) if options.tilt else None
         self.first: float | None = None
 
     def __call__(self, numbers: Float) -> Float:
         """Return the new columns, shape (B, k), of output, shape (B, 3), or with temperature, shape (B, 4)."""
-        output = numbers[:, :3]
-        if self.slopes is not None and numbers.shape[1] > 3:
-            output = self.slopes.at_reference(output, numbers[:, 3], self.model.D)
-        force = self.model.specific_force(output)
+        force = self.result.apply(numbers[:, :3], numbers[:, 3] if numbers.shape[1] > 3 else None)
         if self.first is None and len(force):
             self.first = float(np.median(np.linalg.norm(force[:LOOKED_AT], axis=1))) / self.g
         scaled = force if self.factor == 1.0 else force * self.factor
@@ -132,6 +135,70 @@ class Log:
         from accelcal_cli.io.parquet import to_parquet, to_text
 
         (to_parquet if parquet else to_text)(self.table, self.change, file)
+
+
+@overload
+def apply(
+    result: Calibration | str | Path,
+    data: Frame | str | Path,
+    *,
+    columns: list[str] | None = ...,
+    force: bool = ...,
+    **options: Any,
+) -> polars.DataFrame: ...
+
+
+@overload
+def apply(
+    result: Calibration | str | Path, data: ArrayLike, *, force: bool = ..., **options: Any
+) -> Float: ...
+
+
+def apply(
+    result: Calibration | str | Path,
+    data: Frame | ArrayLike | str | Path,
+    *,
+    columns: list[str] | None = None,
+    force: bool = False,
+    **options: Any,
+) -> polars.DataFrame | Float:
+    """Apply a calibration to readings of any kind: what they mean as specific force.
+
+    Args:
+        result: the calibration, or its file.
+        data: a log, in a file or a frame, or an array of outputs, shape (..., 3).
+        columns: see `read_readings`.
+        force: use a result although its verdict is undetermined.
+        options: fields of `ColumnOptions`, of a log.
+
+    Returns:
+        The log as a frame of polars with the columns fx, fy, fz beside its own; the forces, shape (..., 3), of an
+        array.
+
+    Raises:
+        UsageError: an undetermined result without `force`. DataError: a log that cannot be read.
+
+    Examples:
+        >>> from accelcal_cli import apply, calibrate, simulate
+        >>> simulated = simulate("mems", positions=24)
+        >>> result = calibrate(simulated.output)
+        >>> apply(result, simulated.to_frame()).columns
+        ['pose', 'Nx', 'Ny', 'Nz', 'fx', 'fy', 'fz']
+        >>> apply(result, simulated.output).shape
+        (24, 3)
+    """
+    calibration = result if isinstance(result, Calibration) else load_result(result)
+    calibration.check_determined("result", force=force)
+    if not (isinstance(data, str | Path) or is_frame(data)):
+        return calibration.apply(cast(ArrayLike, data))
+    from accelcal_cli.io.parquet import whole_frame
+
+    table = open_table(cast(str | Path | Frame, data), hashed=False)
+    try:
+        log = prepare(calibration, table, columns, ColumnOptions(**options))
+        return whole_frame(table, log.change)
+    finally:
+        table.close()
 
 
 def prepare(

@@ -6,7 +6,8 @@ Every stage takes one object, of R sensors at once, and returns one; a single se
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +18,10 @@ from accelcal_cli.calibration.fit import fit
 from accelcal_cli.calibration.result import NO_INTERVAL, Calibration, Dop, Sigma
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.calibration.search import Search, reweight, search, state
-from accelcal_cli.calibration.settings import Settings
-from accelcal_cli.errors import DataError
-from accelcal_cli.io.readings import Readings
+from accelcal_cli.calibration.settings import Settings, load_settings, weights_of_log
+from accelcal_cli.errors import ConfigError, DataError
+from accelcal_cli.io.readings import Data, Readings, read_readings
+from accelcal_cli.sensor.model import local_gravity
 
 CURVE_POINTS = 120
 """Points kept of the convergence curve."""
@@ -28,29 +30,86 @@ TOGETHER = 16_384
 """Poses that are calibrated at once, unless one sensor has more: few enough for the processor's caches."""
 
 
-def calibrate(readings: Readings, settings: Settings) -> Calibration:
+def calibrate(
+    data: Data, settings: Settings | None = None, *, columns: Sequence[str] | None = None, **keys: Any
+) -> Calibration:
     """Calibrate one sensor.
 
     Args:
-        readings: J static poses.
-        settings: model, box, optimizer, robustness.
+        data: J static poses: a file, an array of outputs, shape (J, 3), a frame of polars, pandas or Arrow, readings,
+            or the detection of a log, whose poses are weighted by their scatter.
+        settings: model, box, optimizer, robustness; the defaults when None.
+        columns: see `read_readings`.
+        keys: fields of `Settings` to change, and `latitude` with `height` in place of `g`. Without `g` readings that
+            their file states in units of g or mg are taken so, and all others with 9.80665 m/s^2.
 
     Raises:
         DataError: readings without any information (all equal, fewer than two), or without the weights asked for.
-        ConfigError: unknown optimizer or parameter.
+        ConfigError: unknown setting, optimizer or parameter.
+
+    Examples:
+        >>> from accelcal_cli import calibrate, simulate
+        >>> readings = simulate("mems", positions=24, seed=3).output
+        >>> result = calibrate(readings, g=9.81)
+        >>> result.verdict, result.K_a.shape
+        ('good', (3, 3))
+        >>> result.apply(readings).shape
+        (24, 3)
     """
-    return calibrate_many([readings], settings)[0]
+    return calibrate_many([data], settings, columns=columns, **keys)[0]
 
 
-def calibrate_many(readings: Sequence[Readings], settings: Settings) -> list[Calibration]:
+def calibrate_many(
+    data: Sequence[Data],
+    settings: Settings | None = None,
+    *,
+    columns: Sequence[str] | None = None,
+    **keys: Any,
+) -> list[Calibration]:
     """Calibrate sensors; each comes out as it would alone, to the last bit, and sensors with as many poses are faster.
 
     Args:
-        readings: static poses of each sensor; settings: of all of them.
+        data: static poses of each sensor; settings, columns, keys: of all of them, see `calibrate`.
 
     Raises:
         DataError, ConfigError: as in `calibrate`; the message names the sensor.
+
+    Examples:
+        >>> from accelcal_cli import calibrate_many, simulate
+        >>> results = calibrate_many([simulate("mems", positions=12, seed=s).output for s in (1, 2)])
+        >>> [result.verdict for result in results]
+        ['good', 'good']
     """
+    readings = [read_readings(one, columns) for one in data]
+    if settings is not None and not keys:
+        return _calibrated(readings, settings)
+    results: dict[int, Calibration] = {}
+    kinds: dict[tuple[str | None, bool], list[int]] = {}
+    for at, (one, given) in enumerate(zip(readings, data, strict=True)):
+        kinds.setdefault((one.form.unit, one is not given and hasattr(given, "readings")), []).append(at)
+    for (unit, of_log), numbers in kinds.items():
+        own = _settled(settings, unit, dict(keys), of_log=of_log)
+        results |= zip(numbers, _calibrated([readings[at] for at in numbers], own), strict=True)
+    return [results[at] for at in range(len(readings))]
+
+
+def _settled(settings: Settings | None, unit: str | None, keys: dict[str, Any], *, of_log: bool) -> Settings:
+    """Return the settings for readings in a unit, from a log or not, with keys that are stated beside them."""
+    place = {name: keys.pop(name, None) for name in ("latitude", "height")}
+    stated = dict(keys)
+    if of_log and settings is None:
+        stated.setdefault("weights", weights_of_log(keys))
+    if settings is None or "g" in keys or place["latitude"] is not None:
+        g = local_gravity(unit, g=keys.get("g"), **place)
+        stated |= {} if g is None else {"g": g}
+    if settings is None:
+        return load_settings(None, stated)
+    if unknown := set(stated) - {field.name for field in fields(Settings)}:
+        raise ConfigError(f"unknown key{'s' * (len(unknown) > 1)}: {', '.join(sorted(unknown))}")
+    return replace(settings, **stated)
+
+
+def _calibrated(readings: Sequence[Readings], settings: Settings) -> list[Calibration]:
     results: list[Calibration | None] = [None] * len(readings)
     for group in _groups(readings, settings):
         sample = Sample.of([readings[at] for at in group])

@@ -6,9 +6,11 @@ determine the ellipsoid, the start is the least cost itself, and the solver conf
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -25,11 +27,16 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NO_NOISE, NORMAL_MAD, Sample
-from accelcal_cli.calibration.settings import Settings
+from accelcal_cli.calibration.settings import Settings, load_settings
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.io.fleet import FleetReadings
-from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.fleet import FleetReadings, read_fleet
+from accelcal_cli.io.readings import Data, Readings, read_readings
+from accelcal_cli.io.stream import Source, is_frame
 from accelcal_cli.sensor import model as units
+from accelcal_cli.sensor.model import local_gravity
+
+if TYPE_CHECKING:
+    import polars
 
 FAILED = "failed"
 """Verdict on a sensor that cannot be calibrated: a single pose, all of them equal, or weights that it does not give."""
@@ -40,7 +47,7 @@ NAMED = 3
 LEVEL = 0.01
 """Chance of naming a sensor where none stands out (Bonferroni over sensors and quantities)."""
 
-NOISE = "noise of a pose, s"
+NOISE = "noise of one pose, s"
 """Name of the quantity s beside those of the nine parameters."""
 
 FEWEST = 10
@@ -73,6 +80,7 @@ class Fleet:
         warnings: what speaks against the readings and the fit, as `calibrate` says it, a tuple of Notice each,
             shape (R,).
         outlying: the poses beyond chance, in words.
+        labels: of the sensors, shape (R,); empty where only their numbers are known.
     """
 
     number: Int
@@ -94,6 +102,21 @@ class Fleet:
     reason: np.ndarray
     warnings: np.ndarray
     outlying: np.ndarray
+    labels: np.ndarray = field(default_factory=lambda: np.array([], dtype=object))
+
+    def __str__(self) -> str:
+        """How many sensors there are of each verdict."""
+        from accelcal_cli.views.fleet import counts
+
+        return counts(self)
+
+    def to_frame(self) -> polars.DataFrame:
+        """Return one row per sensor as a frame of polars: verdict, parameters, sigma, fit, and what is wrong."""
+        from accelcal_cli.output.machine import frame
+        from accelcal_cli.views.fleet import sensors
+
+        labels = self.labels.tolist() or [str(number + 1) for number in self.number]
+        return frame(sensors(self, labels, ()))
 
     @cached_property
     def determined(self) -> Bool:
@@ -104,6 +127,46 @@ class Fleet:
     def warned(self) -> Bool:
         """Of which sensors there is a note or a warning, shape (R,)."""
         return np.array([len(said) > 0 for said in self.warnings], dtype=bool)
+
+
+def fleet(
+    data: Source | Sequence[str] | Mapping[str, Data],
+    *,
+    sensor: str | None = None,
+    columns: Sequence[str] | None = None,
+    **keys: Any,
+) -> Fleet:
+    """Calibrate the sensors of a fleet, each as `calibrate` with Levenberg-Marquardt would by itself.
+
+    Args:
+        data: a table, in a file or a frame, with a column that labels the sensor; one file per sensor; or readings by
+            label, see `read_readings`.
+        sensor: the column that labels the sensor; found by its name when None.
+        columns: see `read_readings`.
+        keys: fields of `Settings`, or `latitude` with `height` in place of `g`.
+
+    Raises:
+        ConfigError: settings that are not for a fleet. DataError: a table that cannot be read.
+
+    Examples:
+        >>> from accelcal_cli import fleet, simulate
+        >>> poses = {f"S{n}": simulate("mems", positions=24, seed=n).output for n in (1, 2, 3)}
+        >>> print(fleet(poses))
+        3 sensors: 3 good
+    """
+    place = {name: keys.pop(name, None) for name in ("g", "latitude", "height")}
+    keys = {"optimizer": "levenberg-marquardt", **keys}
+    if isinstance(data, Mapping):
+        each = [read_readings(one, columns) for one in data.values()]
+        g = local_gravity(each[0].form.unit if each else None, **place)
+        settings = load_settings(None, keys if g is None else {**keys, "g": g})
+        whole = calibrate_each(each, settings)
+        return replace(whole, labels=np.array(list(data), dtype=object))
+    sources = [data] if isinstance(data, str | Path) or is_frame(data) else list(cast(Sequence[str], data))
+    readings = read_fleet(cast(Sequence[Source], sources), columns, sensor)
+    g = local_gravity(readings.unit, **place)
+    whole = calibrate_fleet(readings, load_settings(None, keys if g is None else {**keys, "g": g}))
+    return replace(whole, labels=np.array(readings.sensors, dtype=object)[whole.number])
 
 
 def check_settings(settings: Settings, *, each: bool = False) -> None:
@@ -202,9 +265,8 @@ def calibrate_each(
 def _joined(parts: Sequence[Fleet]) -> Fleet:
     """Return the parts as one fleet, in the order of the sensors."""
     order = np.argsort(np.concatenate([part.number for part in parts]))
-    return Fleet(
-        **{f.name: np.concatenate([getattr(part, f.name) for part in parts])[order] for f in fields(Fleet)}
-    )
+    names = [f.name for f in fields(Fleet) if f.name != "labels"]
+    return Fleet(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
 
 
 def _part(assessment: Assessment, number: Int) -> Fleet:

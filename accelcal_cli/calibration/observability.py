@@ -3,7 +3,7 @@
 Nine parameters, all as specific force in m/s^2 and always in gauge `lower`: g times the entries of the
 lower-triangular E in K_A = (I + E) K_A0, and K_A0's diagonal times the bias. Their residuals are
 e_j = (g^2 - |f_j|^2) / 2g. The dilution of precision of a parameter is the square root of its entry in
-(J^T J)^-1: how many times the noise of one pose its error comes out. It depends on the poses alone.
+(J^T J)^-1: the error of a parameter divided by the noise of one pose. It depends on the poses alone.
 
 Attitudes, not rows, are what determines: the dilution of precision falls with the root of the number of rows, so that
 noise seems to determine what the attitudes cannot. The geometry of a set of poses is therefore judged by its distinct

@@ -11,9 +11,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.distributions import student_freedom, student_quantile
@@ -36,14 +37,23 @@ from accelcal_cli.notices import Notice
 from accelcal_cli.schema import Limits, array, from_mapping, frozen, to_mapping
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, ErrorModel, Gauge
 
+if TYPE_CHECKING:
+    import polars
+    from matplotlib.axes import Axes
+
 NEAR_G = 0.02
 """Local gravity is within this part of 9.80665 m/s^2, anywhere."""
 
-SCHEMA = "accelcal/calibration/2"
-"""Name and version of the record; a reader refuses what it does not know."""
+SCHEMA = "accelcal/calibration/3"
+"""Name and version of the record; a reader refuses what it does not know.
 
-OLDER = "accelcal/calibration/1"
-"""The version before it, which is read, too: see `_of_older`."""
+Its poses are numbered from 1, as in tables and pictures; in memory they are numbered from 0."""
+
+OLDER, FROM_ZERO = "accelcal/calibration/1", "accelcal/calibration/2"
+"""The versions before it, which are read, too: see `_of_older`; the second numbered poses from 0."""
+
+RESULTS = (".yaml", ".yml", ".json")
+"""Endings of a result file; they choose its form."""
 
 ENGINEERING = ("value", "sigma", "interval")
 """Keys of each kind in the engineering view of a record."""
@@ -197,7 +207,9 @@ class PoseFit:
 
 @frozen(eq=False)
 class Calibration:
-    """A calibrated accelerometer. Units: f in m/s^2 (units of g when g = 1), N in output units.
+    """A calibrated accelerometer, which prints, draws, saves and applies itself.
+
+    Units: f in m/s^2 (units of g when g = 1), N in output units.
 
     Attributes:
         K_a: pulse-equivalent matrix, shape (3, 3), output units per m/s^2, in `gauge`.
@@ -209,7 +221,7 @@ class Calibration:
         dop: dilution of precision of the poses as they count; geometry: of their distinct attitudes, each counted once
             and all together as twelve, which the verdict on the poses rests on.
         verdict: good, weak, suspect or undetermined; `reasons` says in sentences what the poses leave open.
-        suggestions: poses that would mend it.
+        suggestions: poses to add.
         warnings: what speaks against the readings, the fit or the search; one of severity `warning` makes it suspect.
         cost_search: L after the search, cost: L after the polish (the same without one), (m/s^2)^4.
         rms, rms_before: of |f| - g after and before, m/s^2; `before` says what the readings were taken for.
@@ -362,6 +374,83 @@ class Calibration:
             temperature=slopes,
         )
 
+    def apply(self, output: ArrayLike, temperature: ArrayLike | None = None) -> Float:
+        """Return the specific force that readings mean, in `unit`, shape (..., 3).
+
+        Args:
+            output: N, output units, shape (..., 3).
+            temperature: of each reading, shape (...), in the unit of the readings that were calibrated; without it they
+                are taken to be at the reference temperature.
+        """
+        numbers: Float = np.asarray(output, dtype=np.float64)
+        if self.temperature is not None and temperature is not None:
+            degrees = np.broadcast_to(np.asarray(temperature, dtype=np.float64), numbers.shape[:-1])
+            flat = self.temperature.at_reference(numbers.reshape(-1, 3), degrees.ravel(), self.D_a)
+            numbers = flat.reshape(numbers.shape)
+        return self.model.specific_force(numbers)
+
+    def save(self, path: str | Path) -> None:
+        """Write the result file, JSON where the name ends in .json, else YAML; whole or not at all.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        from accelcal_cli.output.files import whole_file
+        from accelcal_cli.output.machine import result_text
+
+        with whole_file(str(path), binary=True) as file:  # read back as UTF-8, whatever the terminal takes
+            file.write(result_text(self, json=str(path).endswith(".json")).encode())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Return the calibration of a result file, see `load_result`."""
+        return load_result(path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the record that a result file holds, see `record`."""
+        return self.record()
+
+    def to_frame(self) -> polars.DataFrame:
+        """Return the parameters as a frame of polars: parameter, value, sigma, half of the 95 % interval, unit."""
+        from accelcal_cli.output.machine import frame
+        from accelcal_cli.views.calibration import numbers
+
+        return frame(numbers(self))
+
+    def __str__(self) -> str:
+        """The verdict, the parameters as they are quoted, and the fit, on at most fifteen lines."""
+        from accelcal_cli.views.quoted import text
+
+        return text(self)
+
+    def _repr_pretty_(self, printer: Any, _: bool) -> None:
+        """The same where IPython has no HTML."""
+        printer.text(str(self))
+
+    def _repr_html_(self) -> str:
+        """The same as a table, for notebooks."""
+        from accelcal_cli.views.quoted import html
+
+        return html(self)
+
+    def plot_residuals(self, axes: Axes | None = None) -> Axes:
+        """Draw |f| - g of every kept pose before and after calibration with matplotlib."""
+        from accelcal_cli.output.plot import residuals
+
+        return residuals(self, axes)
+
+    def plot_convergence(self, axes: Axes | None = None) -> Axes:
+        """Draw the best cost so far against the evaluations with matplotlib."""
+        from accelcal_cli.output.plot import search
+
+        return search(self, axes)
+
+    def plot_intervals(self, axes: Axes | None = None) -> Axes:
+        """Draw the nine parameters with their 95 % intervals, in units of the largest of each kind."""
+        from accelcal_cli.output.plot import intervals
+
+        return intervals(self, axes)
+
     def check_determined(self, name: str, *, force: bool = False) -> None:
         """Refuse to be used where the poses left parameters undetermined, unless forced.
 
@@ -385,7 +474,7 @@ class Calibration:
             key: {kind: column[part] for kind, column in zip(ENGINEERING, columns, strict=True)}
             for key, part in (("scale_error", SCALE), ("misalignment", MISALIGNMENT), ("bias", BIAS))
         }
-        return {**to_mapping(self), "engineering": to_mapping(view)}
+        return {**_renumbered(to_mapping(self), 1), "engineering": to_mapping(view)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any], where: str) -> Calibration:
@@ -397,7 +486,11 @@ class Calibration:
         older = record.get("schema") == OLDER
         if older:
             record = _of_older(record)
-        if record.get("schema") != SCHEMA:
+        elif record.get("schema") == FROM_ZERO:
+            record = {**record, "schema": SCHEMA}
+        elif record.get("schema") == SCHEMA:
+            record = _renumbered(record, -1)
+        else:
             raise DataError(f'{where}: schema is {record.get("schema")!r}; expected "{SCHEMA}"')
         place = f"{where}: not a calibration result"
         try:
@@ -413,6 +506,22 @@ class Calibration:
             return result
         freedom = result.freedom
         return result.with_intervals(student_quantile(0.975, freedom) if freedom > 0 else math.nan)
+
+
+def _renumbered(record: Mapping[str, Any], by: int) -> dict[str, Any]:
+    """Return a record with the numbers of its poses moved; what is no number stays, for the reader to refuse."""
+    new, fits, outliers = dict(record), record.get("poses_fit"), record.get("outliers")
+    if isinstance(fits, list):
+        new["poses_fit"] = [
+            {**fit, "pose": _moved(fit.get("pose"), by)} if isinstance(fit, Mapping) else fit for fit in fits
+        ]
+    if isinstance(outliers, list):
+        new["outliers"] = [_moved(pose, by) for pose in outliers]
+    return new
+
+
+def _moved(pose: object, by: int) -> object:
+    return pose + by if isinstance(pose, int) and not isinstance(pose, bool) else pose
 
 
 AGAIN = "Calibrate the readings again."

@@ -213,7 +213,7 @@ class Sample:
         return replace(self, lower=lower, upper=upper, blocks=lambda: iter([(0, output)]))
 
     def counts(self, choice: Weights) -> Float | None:
-        """Return weights by how many raw readings a pose is the mean of, or None for all alike; see `normalised`.
+        """Return weights by the number of raw readings behind each pose, or None for all alike; see `normalised`.
 
         For choices other than `n` the poses count alike.
         """

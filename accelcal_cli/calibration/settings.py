@@ -157,3 +157,8 @@ def load_settings(path: Path | None, overrides: Mapping[str, Any]) -> Settings:
     settings = from_mapping(Settings, {**merged, "parameters": parameters}, where)
     settings.build_optimizer()
     return settings
+
+
+def weights_of_log(keys: Mapping[str, Any]) -> str:
+    """Return how the static poses of a log are weighted unless something else is stated, by the other keys."""
+    return "n" if keys.get("misalignment") is False else "auto"

@@ -17,9 +17,7 @@ from accelcal_cli.schema import frozen
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
-
-SUFFIXES = (".yaml", ".yml", ".json")
-"""Endings of a result file; they choose its form."""
+    from accelcal_cli.views.blocks import Block, Table
 
 ROBUST = ("none", "huber", "soft-l1")
 ATTITUDES = ("unknown", "known")
@@ -138,12 +136,14 @@ def command(
         options.in_output("--output", "-o", help="Result file: .yaml or .json; - is standard output."),
     ] = None,
     format: options.Format = "table",
+    verbose: options.Verbose = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Calibrate an accelerometer from static readings.
 
-    Prints the K matrix and the bias with their uncertainty, how well the poses determine them, and a verdict.
-    Exit code 1 means that the verdict is "suspect" or "undetermined", or that --tolerance was missed.
+    Prints a verdict, the K matrix and the bias with their 95 % intervals, and the fit; with --verbose also every pose,
+    how well the poses determine each parameter, and the search. Exit code 1 means that the verdict is "suspect" or
+    "undetermined", or that --tolerance was missed.
     """
     from accelcal_cli.calibration.calibrate import calibrate
     from accelcal_cli.io.readings import read_readings
@@ -176,7 +176,7 @@ def command(
         result = replace(result, worn=rest.figures(result))
     missed = tolerance is not None and not result.rms <= tolerance
     with process.even_if_unread():
-        _show(result, format, output)
+        _show(result, format, output, verbose=verbose)
     with process.even_if_unread(sys.stderr):
         options.tell_written([output], quiet)
         if format != "table" or output == "-":  # the table shows them itself
@@ -190,14 +190,13 @@ def command(
 
 def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Settings:
     """Return the settings; poses of a raw log are weighted unless the file says otherwise."""
-    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.calibration.settings import load_settings, weights_of_log
     from accelcal_cli.config import load_mapping
 
     if raw:
         keys = {} if config is None else load_mapping(config)
         if "weights" not in keys:
-            aligned = {**keys, **stated}.get("misalignment") is False
-            stated.setdefault("weights", "n" if aligned else "auto")
+            stated.setdefault("weights", weights_of_log({**keys, **stated}))
     return load_settings(config, stated)
 
 
@@ -223,24 +222,32 @@ def _check_output(output: str | None, format: str) -> None:
         raise UsageError(f"-o - prints the result file; leave out --format {format}")
     if output in (None, "-"):
         return
+    from accelcal_cli.calibration.result import RESULTS
     from accelcal_cli.output.files import is_stream
 
-    if Path(output).suffix not in SUFFIXES and not is_stream(output) and not Path(output).is_dir():
-        raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(SUFFIXES)}')
+    if Path(output).suffix not in RESULTS and not is_stream(output) and not Path(output).is_dir():
+        raise UsageError(f'-o "{output}": expected a name that ends in {", ".join(RESULTS)}')
 
 
-def _show(result: Calibration, format: str, output: str | None) -> None:
+def _show(result: Calibration, format: str, output: str | None, *, verbose: bool) -> None:
     """Write the result file, then print the result in the chosen form."""
     if output is not None:
-        from accelcal_cli.config import dump
-        from accelcal_cli.output.files import whole_file
-        from accelcal_cli.output.machine import json_text
-
-        text = json_text(result.record()) if output.endswith(".json") else dump(result.record())
-        with whole_file(output, binary=True) as file:  # read back as UTF-8, whatever the terminal takes
-            file.write(text.encode())
+        result.save(output)
         if output == "-":
             return
-    from accelcal_cli.views.calibration import blocks, values
 
-    options.print_result(format, partial(values, result), partial(blocks, result), result.record)
+    def table() -> Table:
+        from accelcal_cli.views.calibration import values
+
+        return values(result)
+
+    def shown() -> list[Block]:
+        if verbose:
+            from accelcal_cli.views.calibration import blocks
+
+            return blocks(result)
+        from accelcal_cli.views.quoted import screen
+
+        return screen(result)
+
+    options.print_result(format, table, shown, result.record)

@@ -38,12 +38,13 @@ def command(
         ),
     ] = None,
     format: options.Format = "table",
+    verbose: options.Verbose = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find the static poses in a raw log.
 
     Prints the poses, and with -o writes them as the CSV file that `calibrate` reads. Several thresholds are tried,
-    and the one whose poses calibrate best is kept. `calibrate --raw` does both in one.
+    and the one whose poses calibrate best is kept; --verbose shows them. `calibrate --raw` does both in one.
     """
     from accelcal_cli.detection.detect import TooFewPosesError
     from accelcal_cli.output.files import whole_file
@@ -75,7 +76,7 @@ def command(
             write_csv(poses, file)
     if output != "-":
         options.print_result(
-            format, poses, partial(views.blocks, detection), partial(views.record, detection)
+            format, poses, partial(views.blocks, detection, verbose), partial(views.record, detection)
         )
     sys.stdout.flush()
     options.warn(data, detection.warnings, quiet)

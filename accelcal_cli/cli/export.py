@@ -67,9 +67,8 @@ def command(
     Warns of what the format cannot hold: PX4 and ArduPilot have no misalignments and no temperature slopes of the
     scale factors.
     """
-    from accelcal_cli.exporters.base import EXPORTERS
+    from accelcal_cli.exporters.base import EXPORTERS, export
     from accelcal_cli.output.files import whole_file
-    from accelcal_cli.schema import from_mapping
 
     cls = EXPORTERS.get(to)
     stated = options.stated(**vars(target))
@@ -79,16 +78,15 @@ def command(
             raise UsageError(
                 f"--{option.replace('_', '-')} does not apply to --to {to}; it applies to {', '.join(takers)}"
             )
-    exporter = from_mapping(cls, stated, f"--to {to}")
     options.check_files([result], {"-o": output})
     if cls.binary and output == "-" and sys.stdout.isatty():
         raise UsageError(f"--to {to} is not text for a terminal; name a file with -o")
     calibration = options.load_result(result)
     calibration.check_determined(result, force=force)
     options.warn(result, calibration.warnings, quiet)
-    export = exporter.export(calibration)
+    made = export(calibration, to, force=True, **stated)
     with whole_file(output, binary=True) as file:
-        file.write(export.content)
+        file.write(made.content)
     sys.stdout.flush()
-    options.tell((f"warning: {text}" for text in export.warnings), quiet)
+    options.tell((f"warning: {text}" for text in made.warnings), quiet)
     options.tell_written([output], quiet)

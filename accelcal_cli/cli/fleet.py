@@ -98,12 +98,13 @@ def command(
         ),
     ] = None,
     format: options.Format = "table",
+    verbose: options.Verbose = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Calibrate thousands of sensors at once.
 
-    Every sensor as `calibrate --optimizer levenberg-marquardt` would by itself. Prints how the fleet spreads, which
-    sensors fit worst, which stand out and which are not determined; --format csv or json prints a row for each.
+    Every sensor as `calibrate --optimizer levenberg-marquardt` would by itself. Prints which sensors are not good,
+    which stand out and how the fleet spreads; --format csv or json prints a row for each.
     Exit code 1 means that a sensor is suspect, undetermined or failed, or missed the --tolerance.
     """
     from accelcal_cli.calibration.fleet import calibrate_each, calibrate_fleet, check_settings
@@ -162,7 +163,7 @@ def command(
     else:
         fleet = run(settings, None)
     with process.even_if_unread():
-        _show(fleet, labels, settings, format, None if folder else output)
+        _show(fleet, labels, settings, format, None if folder else output, verbose=verbose)
     bad = _bad(fleet, tolerance)
     with process.even_if_unread(sys.stderr):
         options.tell(notes, quiet)
@@ -300,7 +301,9 @@ def _check_output(output: str) -> bool:
     return False
 
 
-def _show(fleet: Fleet, labels: Sequence[str], settings: Settings, format: str, output: str | None) -> None:
+def _show(
+    fleet: Fleet, labels: Sequence[str], settings: Settings, format: str, output: str | None, *, verbose: bool
+) -> None:
     """Write the table of all sensors, then print the fleet in the chosen form."""
     from accelcal_cli.calibration.fleet import standouts
     from accelcal_cli.output.machine import write_table
@@ -310,7 +313,9 @@ def _show(fleet: Fleet, labels: Sequence[str], settings: Settings, format: str, 
     rows = cache(partial(fleet_tables.sensors, fleet, labels, outlying))  # made when asked for
     if output is not None:
         write_table(rows(), output)
-    options.print_result(format, rows, partial(fleet_tables.blocks, fleet, labels, outlying, settings.g))
+    options.print_result(
+        format, rows, partial(fleet_tables.blocks, fleet, labels, outlying, settings.g, verbose)
+    )
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:

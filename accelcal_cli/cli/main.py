@@ -135,6 +135,14 @@ class Command(typer.core.TyperCommand):
             with formatter.section(heading):
                 formatter.write_dl(rows)
 
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002  # typer's signature
+        """Write examples."""
+        from accelcal_cli.cli.examples import EXAMPLES
+
+        with formatter.section("Examples"):
+            for example in EXAMPLES[self.name or ""]:
+                formatter.write(f"  {example}\n")
+
 
 class LazyCommands(Mapping[str, Any]):
     """The commands by name, each imported and built when it is asked for: a calibration pays for no other."""
@@ -181,7 +189,6 @@ app = typer.Typer(
     name="accelcal",
     cls=Commands,
     help="Calibrate three-axis accelerometers without a turntable.",
-    no_args_is_help=True,
     **STYLE,
 )
 
@@ -204,6 +211,10 @@ def program(
 def main() -> None:
     """Run the command line; exit 0 done, 1 done with a bad verdict, 2 bad input, 128 + n by signal n."""
     _open_streams()
+    if sys.argv[1:] in ([], ["help"]):
+        _guide()
+    if sys.argv[1:2] == ["help"]:
+        sys.argv[1:] = [*sys.argv[2:], "--help"]
     try:
         with process.raised():
             code = app(prog_name="accelcal", standalone_mode=False)
@@ -229,11 +240,20 @@ def main() -> None:
     sys.exit(code)
 
 
+def _guide() -> NoReturn:
+    """Print how to begin."""
+    from accelcal_cli.cli.examples import GUIDE
+
+    try:
+        sys.stdout.write(GUIDE)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _leave_pipe()
+    sys.exit(0)
+
+
 def _explain(error: Any) -> NoReturn:
-    """Print what is wrong with the command line in one line, or the help when nothing was asked for."""
-    if len(sys.argv) == 1:
-        typer.echo(error.format_message(), err=True)
-        sys.exit(BAD_INPUT)
+    """Print what is wrong with the command line in one line."""
     command = error.ctx.command_path if error.ctx else "accelcal"
     text = error.format_message().rstrip(".")
     _fail(f"{text[:1].lower()}{text[1:]} (see {command} --help)", BAD_INPUT)

@@ -16,6 +16,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -172,6 +173,9 @@ Format = Annotated[
         callback=_check_format,
     ),
 ]
+Verbose = Annotated[
+    bool, in_output("--verbose", "-v", help="Print all there is: more than one screen of a terminal.")
+]
 Quiet = Annotated[bool, in_output("--quiet", "-q", help="Print nothing on standard error but errors.")]
 
 
@@ -189,37 +193,14 @@ class GravityOptions:
     height: Annotated[float | None, in_input(help="Metres above the ellipsoid, with --latitude.")] = None
 
     def in_unit(self, unit: str | None) -> float | None:
-        """Return the stated local gravity in the unit of the readings, g or mg; without one as `stated` does.
+        """Return the stated local gravity in the unit of the readings, see `local_gravity`."""
+        from accelcal_cli.sensor.model import local_gravity
 
-        Where nothing was stated it is 1 g in units of g, which is as good as the 9.80665 of other readings. What --g
-        states is taken as it is: the user knows the unit.
-
-        Args:
-            unit: as the file states it, None where it does not.
-        """
-        from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
-
-        stated = self.stated()
-        if unit not in ("g", "mg") or self.g is not None:
-            return stated
-        size = OUTPUT_OF_1_G[unit]
-        return size if stated is None else stated * size / STANDARD_GRAVITY
+        return local_gravity(unit, **vars(self))
 
     def stated(self) -> float | None:
-        """Return the stated local gravity in m/s^2, or None when nothing was stated.
-
-        Raises:
-            UsageError: out of range, stated twice, or a height without a latitude.
-        """
-        from accelcal_cli.sensor.model import check_gravity, normal_gravity
-
-        if self.g is not None and self.latitude is not None:
-            raise UsageError("--g and --latitude: expected one of them, not both")
-        if self.height is not None and self.latitude is None:
-            raise UsageError("--height needs --latitude")
-        if self.g is not None:
-            return check_gravity(self.g)
-        return None if self.latitude is None else normal_gravity(self.latitude, self.height or 0.0)
+        """Return the stated local gravity in m/s^2, or None when nothing was stated."""
+        return self.in_unit(None)
 
 
 @frozen()
@@ -514,7 +495,7 @@ def check_plot(plot: str | None) -> None:
 
     check_suffix("--plot", plot, PLOT_SUFFIXES)
     if find_spec("matplotlib") is None:
-        raise UsageError("--plot needs matplotlib: pip install 'accelcal[plot]'")
+        raise UsageError("--plot needs matplotlib: python -m pip install matplotlib")
 
 
 def split_columns(text: str | None) -> list[str] | None:
@@ -574,9 +555,14 @@ def print_result(
 
 
 def tell(notes: Iterable[str], quiet: bool = False) -> None:
-    """Say something on standard error, a line each, unless quiet."""
+    """Say something on standard error, a line each, unless quiet; on a terminal in lines that fit."""
     for note in () if quiet else notes:
-        typer.echo(visible(f"accelcal: {note}"), err=True)
+        text = visible(f"accelcal: {note}")
+        if sys.stderr.isatty():
+            from accelcal_cli.views.blocks import wrapped
+
+            text = wrapped(text, get_terminal_size().columns, "", "  ")
+        typer.echo(text, err=True)
 
 
 def tell_written(paths: Iterable[str | None], quiet: bool) -> None:

@@ -16,12 +16,9 @@ from accelcal_cli.errors import UsageError
 if TYPE_CHECKING:
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.io.readings import Readings
-    from accelcal_cli.planning import Plan
 
 MOST_POSES = 200
-FROM_NOTHING, NEXT = 12, 6
-RESULTS = (".yaml", ".yml", ".json")
-"""Endings of a result file; anything else holds readings."""
+"""As in `planning`; a test compares them."""
 
 in_plan = options.panel("Plan")
 
@@ -71,30 +68,30 @@ def command(
         in_plan(help="Noise of one pose, one sigma, m/s^2.", show_default="s of the poses so far"),
     ] = None,
     format: options.Format = "table",
+    verbose: options.Verbose = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Plan the next poses: those that shrink the worst sigma.
 
-    Prints them in words and as vectors, and the sigma to expect after each. Exit code 1 means that not even all
-    these poses determine the parameters.
+    Prints them in words, and the sigma to expect after each; with --verbose also as vectors. Exit code 1 means that
+    not even all these poses determine the parameters.
     """
+    from accelcal_cli.planning import plan
     from accelcal_cli.views import plan as views
 
     options.check_choice("--fixture", fixture, options.FIXTURES)
     options.check_positive("--noise", noise, " in m/s^2")
-    if poses is not None and add is not None:
-        raise UsageError("--poses and --add: expected one of them, not both")
     log.check_raw(raw)
     if raw and data is None:
         raise UsageError("--raw needs the name of a log")
     stated_g = gravity.stated()
     so_far = _so_far(data, columns, form, gravity, log if raw else None) if data is not None else None
-    proposal = _plan(so_far, poses, add, fixture, noise, stated_g)
+    proposal = plan(so_far, poses=poses, add=add, fixture=fixture, noise=noise, g=stated_g)
     with process.even_if_unread():
         options.print_result(
             format,
             partial(views.pose_table, proposal),
-            partial(views.blocks, proposal),
+            partial(views.blocks, proposal, verbose),
             partial(views.record, proposal),
         )
     with process.even_if_unread(sys.stderr):
@@ -113,7 +110,7 @@ def _so_far(
 ) -> Calibration:
     """Return the calibration of the poses so far; those of a raw log are found as `log` says."""
     from accelcal_cli.calibration.calibrate import calibrate
-    from accelcal_cli.calibration.result import is_result, load_result
+    from accelcal_cli.calibration.result import RESULTS, is_result, load_result
     from accelcal_cli.calibration.settings import load_settings
     from accelcal_cli.io.readings import read_readings
 
@@ -168,30 +165,3 @@ def _head(stdin: io.BufferedReader) -> bytes:
         return stdin.peek()
     except OSError:
         return b""
-
-
-def _plan(
-    so_far: Calibration | None,
-    poses: int | None,
-    add: int | None,
-    fixture: str,
-    noise: float | None,
-    g: float | None,
-) -> Plan:
-    import numpy as np
-
-    from accelcal_cli.planning import plan
-    from accelcal_cli.sensor.model import STANDARD_GRAVITY
-
-    existing = 0 if so_far is None else so_far.poses
-    count = add or ((poses or FROM_NOTHING) - existing if poses or so_far is None else NEXT)
-    if count < 1:
-        raise UsageError(f"--poses {poses}: {existing} poses exist already; expected more, or --add")
-    if count > MOST_POSES:
-        raise UsageError(f"--poses {poses}: {count} poses to plan; expected at most {MOST_POSES}")
-    local_g = g or STANDARD_GRAVITY
-    if so_far is None:
-        return plan(np.zeros((9, 9)), 0, count, fixture, None if noise is None else noise / local_g)
-    sigma = noise or (so_far.s if so_far.freedom > 0 else 0.0)
-    part = sigma / so_far.g if sigma > 0 else None
-    return plan(so_far.information, existing, count, fixture, part, so_far)

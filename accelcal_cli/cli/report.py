@@ -27,18 +27,16 @@ def command(
     links to others, readable light and dark, on a telephone and on paper. Exit code 1 means that the verdict is
     "suspect" or "undetermined"; the report is written all the same.
     """
-    from accelcal_cli.output.files import is_stream, whole_file
-    from accelcal_cli.output.report import check_packages, page
+    from accelcal_cli.output.files import is_stream
+    from accelcal_cli.output.report import check_packages, report
 
     if output != "-" and not Path(output).is_dir() and not is_stream(output):
         options.check_suffix("-o", output, SUFFIXES)
     options.check_files([result], {"-o": output})
     check_packages()
     calibration = options.load_result(result)
-    source = Path(str(calibration.data.get("source", result))).name
-    text = page(calibration, title or f"Calibration of {source}")
-    with process.even_if_unread(), whole_file(output, binary=True) as file:
-        file.write(text.encode())  # the page says that it is UTF-8, whatever the terminal takes
+    with process.even_if_unread():
+        report(calibration, output, title=title)
     with process.even_if_unread(sys.stderr):
         options.tell_written([output], quiet)
     if calibration.verdict in options.BAD_VERDICTS:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,13 +27,14 @@ from accelcal_cli.detection.intervals import (
     sample_windows,
 )
 from accelcal_cli.detection.log_screening import Liveliness, alternating, check_gravity
-from accelcal_cli.detection.rawlog import RawLog
-from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, read_tiles
+from accelcal_cli.detection.rawlog import RawLog, open_raw_log
+from accelcal_cli.detection.windows import Envelope, RowLengths, Spans, Tiles, parse_span, read_tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import InputForm, Readings
 from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
+from accelcal_cli.io.stream import Source
 from accelcal_cli.notices import Notice
-from accelcal_cli.sensor.model import STANDARD_GRAVITY
+from accelcal_cli.sensor.model import STANDARD_GRAVITY, local_gravity
 
 MULTIPLIERS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 100.0)
 """Tried when none is stated; [tedaldi2014] tries 2 to 10 times the variance of a marked still period."""
@@ -101,6 +103,7 @@ class Detection:
         envelope: of the log, for a picture; None unless asked for.
         warnings: what the rows show that is no rest.
         behind: the first rows of acceleration and the extremes of all, sensor units; None where they are not known.
+        time_unit: of the times of the poses; began: date and time of the first row, None where they are not known.
     """
 
     source: str
@@ -119,6 +122,8 @@ class Detection:
     envelope: Envelope | None = None
     warnings: tuple[Notice, ...] = ()
     behind: Behind | None = None
+    time_unit: str = "s"
+    began: np.datetime64 | None = None
 
     def readings(self) -> Readings:
         """Return the poses as readings that carry the origin of the log."""
@@ -164,17 +169,65 @@ class TooFewPosesError(DataError):
         self.detection = detection
 
 
-def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Detection:
+def detect(
+    log: RawLog | Source,
+    settings: DetectSettings | None = None,
+    picture: bool = False,
+    *,
+    columns: Sequence[str] | None = None,
+    gyro: Sequence[str] | None = None,
+    time: str | None = None,
+    **keys: Any,
+) -> Detection:
     """Find the static poses of a raw log in one pass; with `picture` keep its envelope.
 
     Of several multipliers the one is kept whose calibration has the least sigma in its worst parameter, among those
     of the best verdict with enough attitudes: a longer list of poses counts only as far as the attitudes differ.
     Of those that come within 5 % of it the smallest multiplier is kept.
 
+    Args:
+        log: a file, a frame, or an open log.
+        settings: how the poses are found; the defaults, with `keys`, when None.
+        picture: keep what a picture of the log needs.
+        columns: the three columns of acceleration; gyro: of turning rate; time: a column; see `read_log`.
+        keys: `window`, `still`, `min_length`, `trim` in seconds or as "150rows"; `min_poses`; `rate`, `multipliers`,
+            `merge`, `thin` of `DetectSettings`; `g`, or `latitude` with `height`.
+
     Raises:
         UsageError: lengths that do not fit the log. DataError: unreadable.
         TooFewPosesError: no multiplier finds enough attitudes; the message says what was found.
+
+    Examples:
+        >>> from accelcal_cli import calibrate, detect, simulate
+        >>> log = simulate("mems", positions=13, raw=True, seed=2)
+        >>> detection = detect(log)
+        >>> len(detection.intervals), calibrate(detection).verdict
+        (13, 'good')
     """
+    if isinstance(log, RawLog):
+        return _detected(log, settings or settings_for(log.columns.unit, **keys), picture)
+    opened = open_raw_log(log, columns, gyro, time)
+    try:
+        return detect(opened, settings, picture, **keys)
+    finally:
+        opened.close()
+
+
+def settings_for(unit: str | None, **keys: Any) -> DetectSettings:
+    """Return the settings of a detection for readings in a unit, see `detect`."""
+    spans = {
+        name: parse_span(str(keys.pop(key)), key)
+        for key, name in (("window",) * 2, ("still",) * 2, ("min_length", "least"), ("trim",) * 2)
+        if keys.get(key) is not None
+    }
+    if "min_poses" in keys:
+        keys["least_poses"] = keys.pop("min_poses")
+    place = {name: keys.pop(name, None) for name in ("g", "latitude", "height")}
+    g = local_gravity(unit, **place)
+    return DetectSettings(spans=Spans(**spans), g=STANDARD_GRAVITY if g is None else g, **keys)
+
+
+def _detected(log: RawLog, settings: DetectSettings, picture: bool) -> Detection:
     rate = settings.rate if settings.rate is not None else log.clock.rate
     lengths = settings.spans.rows(rate)
     envelope = Envelope(lengths.tile) if picture else None
@@ -212,6 +265,8 @@ def detect(log: RawLog, settings: DetectSettings, picture: bool = False) -> Dete
         warnings=warnings,
         envelope=envelope,
         behind=Behind(head, tiles.low, tiles.high),
+        time_unit=log.clock.unit,
+        began=log.began,
     )
     if not enough:
         why = explain_too_few(segmentations[kept], candidates[kept], detection)

@@ -10,19 +10,31 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.clock import UNITS, Clock, SoundTimes, seconds_of_dates, unit_of, wrong_time
+from accelcal_cli.io.clock import (
+    UNITS,
+    Clock,
+    SoundTimes,
+    StampReader,
+    seconds_of_dates,
+    unit_of,
+    wrong_time,
+)
 from accelcal_cli.io.columns import RawColumns, choose_raw, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, Selection, open_table
 from accelcal_cli.io.readings import InputForm
 from accelcal_cli.io.rows import MOST_SENSORS, SKIPPABLE, DeadColumns, OneSensor, RowBlock, ZeroRows
+from accelcal_cli.io.stream import Source
 from accelcal_cli.io.vocabulary import parse_unit
 from accelcal_cli.notices import Notice
+
+if TYPE_CHECKING:
+    import polars
 
 PROBE = 1000
 """Rows that determine the step of the time column, and whether a column without a name is time."""
@@ -35,7 +47,7 @@ CHANGES = 50
 
 
 def open_raw_log(
-    source: str | Path,
+    source: Source,
     columns: Sequence[str] | None = None,
     gyro: Sequence[str] | None = None,
     time: str | None = None,
@@ -46,7 +58,7 @@ def open_raw_log(
     """Open a raw log in any form that `read_readings` reads; ``-`` is standard input.
 
     Args:
-        source: path, or ``-``.
+        source: path, ``-``, or a frame.
         columns, gyro: three columns each, by name or by number from 1; found by their names when None; no
             gyroscope with `gyro` of ``["none"]``.
         time: a column, ``"none"``, or None to find it.
@@ -61,10 +73,25 @@ def open_raw_log(
         raise
 
 
+def read_log(source: Source, **how: Any) -> RawLog:
+    """Open a raw log to look at it, or to find its static poses with `detect`.
+
+    Args:
+        source: path, ``-``, or a frame; how: see `open_raw_log`.
+
+    Examples:
+        >>> from accelcal_cli import read_log, simulate
+        >>> log = read_log(simulate("mems", positions=2, raw=True))
+        >>> round(log.clock.rate), log.to_frame().columns
+        (100, ['ax', 'ay', 'az', 't'])
+    """
+    return open_raw_log(source, **how)
+
+
 def sensors_of(
     source: str | Path, sensor: str | None = None, *, options: ReadOptions = PLAIN
 ) -> tuple[tuple[str, str], ...]:
-    """Return the sensors whose rows a log file holds: the label of each, and the condition that chooses its rows.
+    """Return the sensors that a log file has rows of: the label of each, and the condition that chooses its rows.
 
     Args:
         source: path. sensor: the column that labels them; None to find it by its name.
@@ -106,9 +133,11 @@ class RawLog:
         self.zeros = ZeroRows()
         self._table = table
         dated = columns.dated
+        self._stamps: StampReader | None = None
         rows = _of_one(table.blocks(columns.selection()), OneSensor(table, columns.identity, fleet=False))
         if dated:
-            rows = seconds_of_dates(rows, self._time_at, table.facts.day_first, lenient=table.lenient)
+            self._stamps = StampReader(self._time_at, table.facts.day_first, table.lenient)
+            rows = seconds_of_dates(rows, self._stamps)
         self._sound = None
         if table.lenient and columns.time is not None and not columns.guessed:
             self._sound = SoundTimes(table)
@@ -170,6 +199,11 @@ class RawLog:
         return f"{self.name}, {self._table.where(row)}, column {column}"
 
     @property
+    def began(self) -> np.datetime64 | None:
+        """Date and time of the first row, where the time column has dates."""
+        return None if self._stamps is None else self._stamps.began
+
+    @property
     def form(self) -> InputForm:
         """How the log is written; its rows are those of the detection."""
         table, unit = self._table, self.columns.unit
@@ -209,6 +243,16 @@ class RawLog:
                 last = float(numbers[-1, -1])
             yield numbers
         dead.check()
+
+    def to_frame(self) -> polars.DataFrame:
+        """Return the whole log as a frame of polars; the log is read by it, and cannot be read again."""
+        import polars
+
+        columns, names = self.columns, self._table.names
+        named = [*columns.output, *(columns.gyro or ())]
+        named += [k for k in (columns.temperature, columns.time) if k is not None]
+        keys = [str(k + 1) if names is None else names[k] for k in named]
+        return polars.DataFrame(np.concatenate(list(self.blocks())), schema=keys)
 
     def gyro_names(self) -> tuple[str, ...]:
         """Return the names of the gyroscope columns, or their numbers from 1; none without a gyroscope."""

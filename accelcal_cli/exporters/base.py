@@ -9,11 +9,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from accelcal_cli.errors import UsageError
 from accelcal_cli.registry import Registry
-from accelcal_cli.schema import Checked, setting
+from accelcal_cli.schema import Checked, from_mapping, setting
 
 if TYPE_CHECKING:  # the help of `accelcal export` does not wait for numpy
     from accelcal_cli.arrays import Float
@@ -38,6 +39,17 @@ class Export:
 
     content: bytes
     warnings: tuple[str, ...] = ()
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, whole or not at all; OutputError where it cannot be written."""
+        from accelcal_cli.output.files import whole_file
+
+        with whole_file(str(path), binary=True) as file:
+            file.write(self.content)
+
+    def __str__(self) -> str:
+        """The content; what is no text as far as it can be shown."""
+        return self.content.decode(errors="replace")
 
 
 @dataclass(frozen=True)
@@ -111,6 +123,33 @@ class Exporter(Checked, ABC):
 EXPORTERS: Registry[Exporter] = Registry(
     Exporter, "accelcal_cli.exporters", "export format", "accelcal.exporters"
 )
+
+
+def export(result: Calibration | str | Path, to: str, *, force: bool = False, **options: Any) -> Export:
+    """Return a result in the format of another tool.
+
+    Args:
+        result: the calibration, or its file; to: name of the format, one of `EXPORTERS.names()`.
+        force: use a result although its verdict is undetermined.
+        options: of the format, see its class.
+
+    Raises:
+        ConfigError: no such format or option. UsageError: the format cannot hold this result.
+
+    Examples:
+        >>> from accelcal_cli import calibrate, export, simulate
+        >>> result = calibrate(simulate("mems", positions=24).output)
+        >>> file = export(result, "c-header")
+        >>> "accel" in str(file)
+        True
+    """
+    from accelcal_cli.calibration.result import Calibration, load_result
+
+    exporter = from_mapping(EXPORTERS.get(to), options, f"--to {to}")
+    calibration = result if isinstance(result, Calibration) else load_result(result)
+    calibration.check_determined("result" if isinstance(result, Calibration) else str(result), force=force)
+    return exporter.export(calibration)
+
 
 INSTANCE = "number of the accelerometer in the target, from 0; without it that of the vehicle's log, else 0"
 

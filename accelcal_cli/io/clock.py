@@ -179,21 +179,12 @@ def is_counted(cell: str) -> bool:
     return cell.isascii() and cell.isdigit() and len(cell) >= COUNTED
 
 
-def seconds_of_dates(
-    rows: Iterable[RowBlock],
-    place: Callable[[int], str],
-    day_first: bool | None = None,
-    *,
-    lenient: bool = False,
-) -> Iterator[RowBlock]:
+def seconds_of_dates(rows: Iterable[RowBlock], reader: StampReader) -> Iterator[RowBlock]:
     """Yield rows whose first text is a time with the seconds since the first row as one more column.
 
     Args:
-        rows: blocks with text; place: how to name a row (from 0) and its column.
-        day_first: whether dates that do not begin with the year begin with the day; None to find out.
-        lenient: NaN for what is no time.
+        rows: blocks with text; reader: of the texts.
     """
-    reader = StampReader(place, day_first, lenient)
     for block in rows:
         seconds = reader.seconds(list(block.texts[0]), block.start)
         yield RowBlock(block.start, np.column_stack([block.numbers, seconds]), block.texts[1:])
@@ -283,6 +274,11 @@ class StampReader:
     _wrapped: float = 0.0
     _base: int | None = None
     _previous: str = ""
+
+    @property
+    def began(self) -> np.datetime64 | None:
+        """Time of the first row where it is a date; None where it is another style, or no row has come."""
+        return None if self._iso is None else self._iso[0]
 
     def seconds(self, cells: list[str], start: int) -> Float:
         """Return the times of a block in seconds since the first row, shape (B,).

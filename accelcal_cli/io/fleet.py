@@ -22,7 +22,7 @@ from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
 from accelcal_cli.io.rows import RowBlock, ZeroRows, add_stretches, places, zero_rows
 from accelcal_cli.io.screening import LOOKED_AT, ROW_WIDE, UNEQUAL, Screened, needs_look
-from accelcal_cli.io.stream import RowStore
+from accelcal_cli.io.stream import RowStore, Source
 from accelcal_cli.notices import Notice
 
 SLAB = 2_000_000
@@ -250,7 +250,7 @@ def _known(extra: Float | None, at: int, count: int) -> Float | None:
 
 
 def read_fleet(
-    sources: Sequence[str],
+    sources: Sequence[Source],
     columns: Sequence[str] | None = None,
     sensor: str | None = None,
     *,
@@ -269,7 +269,7 @@ def read_fleet(
     """
     check_once(sources)
     each = len(sources) > 1 and sensor is None
-    names: Sequence[str | None] = file_names(sources) if each else [None] * len(sources)
+    names: Sequence[str | None] = file_names(list(map(str, sources))) if each else [None] * len(sources)
     collector = _FleetCollector()
     for source, name in zip(sources, names, strict=True):
         table = open_table(source, stdin, options=options)
@@ -289,10 +289,10 @@ def read_fleet(
     return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras, zeros)
 
 
-def check_once(sources: Sequence[str]) -> None:
+def check_once(sources: Sequence[Source]) -> None:
     """Raise UsageError where a file is given twice."""
     for k, source in enumerate(sources):
-        if source in sources[:k]:
+        if isinstance(source, str | Path) and source in sources[:k]:
             raise UsageError(f"{source}: is given twice")
 
 

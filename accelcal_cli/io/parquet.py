@@ -1,7 +1,8 @@
-"""Tables whose columns have types, Parquet and Arrow, read with polars; logs written as Parquet, or as text."""
+"""Tables whose columns have types, Parquet, Arrow and frames, read with polars; logs written as Parquet, or as text."""
 
 from __future__ import annotations
 
+import hashlib
 import struct
 import tempfile
 from abc import ABC, abstractmethod
@@ -223,6 +224,66 @@ class ArrowTable(ParquetTable):
         return pl.scan_ipc(path)
 
 
+class MemoryTable(FrameTable):
+    """A frame in memory."""
+
+    source_format = "frame"
+
+    def __init__(self, data: object) -> None:
+        """Take over a frame of polars, pandas or Arrow.
+
+        Raises:
+            DataError: a frame that polars does not understand.
+        """
+        self.name = "<frame>"
+        self.filter = None
+        self._whole = frame_of(data)
+        self._take(self._whole.schema)
+        self.has_rows = not self._whole.is_empty()
+
+    def _head(self) -> pl.DataFrame:
+        return self._whole.head(PREVIEW)
+
+    def _batches(self, wanted: Sequence[str]) -> Iterator[pl.DataFrame]:
+        return self._whole.select(wanted).iter_slices(ROWS)
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the columns as an uncompressed Arrow file."""
+        return hashlib.sha256(self._whole.write_ipc(None).getbuffer()).hexdigest()
+
+    def close(self) -> None:
+        """Do nothing: the frame is the caller's."""
+
+
+def frame_of(data: object) -> pl.DataFrame:
+    """Return a frame of polars, pandas, Arrow or whatever speaks the Arrow stream protocol as one of polars.
+
+    Raises:
+        DataError: a frame that polars does not understand.
+    """
+    if isinstance(data, pl.DataFrame):
+        return data
+    if isinstance(data, pl.LazyFrame):
+        return data.collect()
+    try:
+        if type(data).__module__.startswith("pandas"):  # its own Arrow stream needs pyarrow
+            columns: Any = data
+            return pl.DataFrame([_series(str(name), columns[name].to_numpy()) for name in columns.columns])
+        return pl.DataFrame(data)  # type: ignore[arg-type]  # anything with __arrow_c_stream__
+    except (pl.exceptions.PolarsError, TypeError, ValueError) as problem:
+        reason = str(problem).strip().splitlines()[0][:200]
+        raise DataError(f"<frame>: cannot be read as a table ({reason})") from problem
+
+
+def _series(name: str, values: np.ndarray) -> pl.Series:
+    """Return a column of pandas; what it has no type for is text, or nothing where it is missing."""
+    if values.dtype != object:
+        return pl.Series(name, values)
+    missing = [value is None or value != value for value in values]
+    return pl.Series(name, [None if gone else str(v) for v, gone in zip(values, missing, strict=True)])
+
+
 class ArrowStream(FrameTable):
     """A stream of Arrow IPC, a record batch at a time.
 
@@ -359,6 +420,16 @@ def _changed(frame: pl.DataFrame, rows: RowBlock, change: Change) -> pl.DataFram
     values = np.ascontiguousarray(change.compute(rows.numbers).T)
     new = [pl.Series(name, column) for name, column in zip(change.names, values, strict=True)]
     return change.put(frame, new)
+
+
+def whole_frame(table: InputTable, change: Change) -> pl.DataFrame:
+    """Return the changed log in memory."""
+    if isinstance(table, FrameTable | NativeTable):
+        return pl.concat(frames(table, change))
+    assert isinstance(table, TextTable)
+    cells = TextCells(table, change)
+    with tempfile.TemporaryDirectory(prefix="accelcal-") as folder:
+        return pl.concat(cells.typed(cells.keep(Path(folder))))
 
 
 def to_text(table: InputTable, change: Change, file: IO[bytes]) -> None:

@@ -33,7 +33,7 @@ from accelcal_cli.io.dialect import (
     understand,
 )
 from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
-from accelcal_cli.io.stream import LONGEST_LINE, TYPED, ByteSource, open_source
+from accelcal_cli.io.stream import LONGEST_LINE, TYPED, ByteSource, Source, open_source
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
 
@@ -165,13 +165,13 @@ class InputTable(Protocol):
 
 
 def open_table(
-    source: str | Path,
-    stdin: BinaryIO | None = None,
-    *,
-    hashed: bool = True,
-    options: ReadOptions = PLAIN,
+    source: Source, stdin: BinaryIO | None = None, *, hashed: bool = True, options: ReadOptions = PLAIN
 ) -> InputTable:
     """Open a table of any supported form; ``-`` is standard input. Without the hash it is read a little faster."""
+    if not isinstance(source, str | Path):
+        from accelcal_cli.io.parquet import MemoryTable
+
+        return MemoryTable(source)
     stream, path = open_source(source, stdin, hashed=hashed), None if str(source) == "-" else Path(source)
     try:
         if stream.head.startswith(TYPED) or (path and path.suffix.lower() in {".parquet", ".pq"}):

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, Generic, Protocol, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from accelcal_cli.io.columns import Columns, are_no_counts, choose, restrict
 from accelcal_cli.io.reader import LIMIT, PLAIN, ReadOptions, open_table
 from accelcal_cli.io.rows import DeadColumns, OneSensor, RowBlock, ZeroRows
 from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
-from accelcal_cli.io.stream import IN_MEMORY, RowStore
+from accelcal_cli.io.stream import IN_MEMORY, Frame, RowStore, is_frame
 from accelcal_cli.notices import Notice
 from accelcal_cli.schema import frozen
 
@@ -187,23 +187,55 @@ class Readings:
         )
 
 
+class HasReadings(Protocol):
+    """What holds static readings beside other things: a detection, simulated samples."""
+
+    def readings(self) -> Readings:
+        """Return them."""
+
+
+Data = str | Path | Frame | ArrayLike | Readings | HasReadings
+"""What readings are taken from: a file, a frame, an array of shape (J, 3), or what holds them already."""
+
+
 def read_readings(
-    source: str | Path,
+    source: Data,
     columns: Sequence[str] | None = None,
     *,
     stdin: BinaryIO | None = None,
     options: ReadOptions = PLAIN,
 ) -> Readings:
-    """Read static readings from a text table or a Parquet file; ``-`` is standard input.
+    """Read static readings from a file, a frame or an array.
 
-    `columns` names the three output columns, or numbers them from 1; without it their names decide. `options` say what
-    the user knows of the form of a table, and which rows to read. Rows that share a position label are averaged.
+    Rows that share a position label are averaged.
+
+    Args:
+        source: a text table or a Parquet file, ``-`` for standard input; a frame of polars, pandas or Arrow; an array
+            of outputs, shape (J, 3), one pose per row; a detection, or readings, which are returned as they are.
+        columns: names of the three output columns, or their numbers from 1; without it their names decide.
+        stdin: standard input; options: what the user knows of the form of a table, and which rows to read.
 
     Raises:
         DataError: a fault of the input, with its place, or readings of several sensors.
         UsageError: a fault of `columns` or of the conditions `options.where`.
+
+    Examples:
+        >>> import polars
+        >>> from accelcal_cli import read_readings, simulate
+        >>> simulated = simulate("mems", positions=12)
+        >>> read_readings(simulated.output).poses
+        12
+        >>> table = polars.DataFrame(simulated.output, schema=["ax", "ay", "az"])
+        >>> read_readings(table).columns
+        ('ax', 'ay', 'az')
     """
-    table = open_table(source, stdin, options=options)
+    if isinstance(source, Readings):
+        return source
+    if hasattr(source, "readings"):
+        return cast(HasReadings, source).readings()
+    if not (isinstance(source, str | Path) or is_frame(source)):
+        return Readings.from_array(cast(ArrayLike, source))
+    table = open_table(cast(str | Path | Frame, source), stdin, options=options)
     try:
         restrict(table, options.where)
         collector = Collector(table.name, choose(table, columns, count=options.count))

@@ -84,7 +84,7 @@ def _open(name: str, baud: int, timeout: float) -> Serial:
     try:
         import serial
     except ImportError:
-        raise UsageError("a serial port needs pyserial: pip install 'accelcal[serial]'") from None
+        raise UsageError("a serial port needs pyserial: python -m pip install pyserial") from None
     try:
         return serial.Serial(name, baud, timeout=timeout)
     except (OSError, ValueError) as error:  # a SerialException is an OSError

@@ -80,6 +80,22 @@ _NOT_NATIVE = (*TYPED, b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff")
 _Digest = Callable[[bytes], None]
 
 
+class Frame(Protocol):
+    """A table in memory: a frame of polars or pandas, an Arrow table, or another that gives an Arrow stream."""
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Return the table as a capsule, by the Arrow PyCapsule interface."""
+
+
+Source = str | Path | Frame
+"""Where a table comes from: a file, ``-`` for standard input, or a frame."""
+
+
+def is_frame(data: object) -> bool:
+    """Return whether something is a table in memory rather than an array of numbers; polars need not be imported."""
+    return hasattr(data, "__arrow_c_stream__") or type(data).__name__ in ("LazyFrame", "DataFrame")
+
+
 class ByteReader(Protocol):
     """What bytes are read from."""
 

@@ -220,7 +220,7 @@ def _read_grid(path: str, suffix: str, variable: str) -> GravityMap:
         package: Any = importlib.import_module(needed)
     except ImportError:
         raise DataError(
-            f"{path}: needs {needed}: pip install 'accelcal[maps]' (XYZ text needs no package)"
+            f"{path}: needs {needed}: python -m pip install xarray rioxarray netCDF4 (XYZ text needs no package)"
         ) from None
     try:
         if suffix in GEOTIFF:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -21,10 +20,13 @@ from rich.segment import Segment
 from rich.text import Text
 
 from accelcal_cli.errors import visible
-from accelcal_cli.views.blocks import Block, Conclusion, Convergence, Paragraph, Table
+from accelcal_cli.views.blocks import Block, Conclusion, Convergence, Paragraph, Table, wrapped
 
 PIPE_WIDTH = 160
 """Columns of a table that goes into a pipe or a file, where no terminal sets a limit."""
+
+GAP = 2
+"""Blanks before each column of a table."""
 
 NARROWEST_CURVE, NARROWEST_CURVES = 40, 48
 """Columns of the narrowest terminal that gets a plot of one curve, and of several."""
@@ -74,20 +76,20 @@ def show(blocks: Iterable[Block], out: Console | None = None) -> None:
 
 def _show_paragraph(block: Paragraph, out: Console) -> None:
     margin = " " * block.indent
-    text = block.text
-    if block.indent:
-        text = textwrap.fill(text, out.width, initial_indent=margin, subsequent_indent=margin)
-    out.print(Text.assemble((block.heading, "bold"), text))
+    text = wrapped(block.heading + block.text, out.width, margin)
+    head = len(margin) + len(block.heading)
+    out.print(Text.assemble((text[:head], "bold"), text[head:]), soft_wrap=True)
 
 
 def _show_conclusion(block: Conclusion, out: Console) -> None:
     style = VERDICT_STYLE.get(block.verdict, "bold")
     out.print(Text.assemble((f"{block.title}: ", "bold"), (block.verdict, style)))
     for reason in block.reasons:
-        out.print(Text(f"  {reason}"))
+        out.print(Text(wrapped(reason, out.width, "  ")), soft_wrap=True)
     for notice in block.warnings:
         head, colour = ("Warning: ", "bold yellow") if notice.severity == "warning" else ("Note: ", "bold")
-        out.print(Text.assemble((head, colour), str(notice)))
+        text = wrapped(f"{head}{notice}", out.width, "", "  ")
+        out.print(Text.assemble((text[: len(head)], colour), text[len(head) :]), soft_wrap=True)
 
 
 def _show_convergence(block: Convergence, out: Console) -> None:
@@ -105,15 +107,29 @@ def _show_convergence(block: Convergence, out: Console) -> None:
 
 def _show_table(table: Table, out: Console) -> None:
     """Draw a table with its notes; one too wide for the terminal in parts, each with the first column again."""
+    table = _encodable(table, out)
     parts = _parts(table, out.width)
     for part in parts:
         out.print(_drawn(part, out), crop=False)
     if not parts:
         _show_stacked(table, out)
     for note in table.notes:
-        out.print(Text(note))
+        out.print(Text(wrapped(note, out.width)), soft_wrap=True)
     if table.notes or not parts:
         out.print()
+
+
+def _encodable(table: Table, out: Console) -> Table:
+    """Return a table without the sign ± where the encoding lacks it."""
+    try:
+        "±".encode(out.encoding)
+    except (UnicodeEncodeError, LookupError):
+        texts = [
+            [cell.replace("±", "+-") if isinstance(cell, str) else cell for cell in row] for row in table.rows
+        ]
+        columns = tuple(replace(column, name=column.name.replace("±", "+-")) for column in table.columns)
+        return replace(table, title=table.title.replace("±", "+-"), columns=columns, rows=tuple(texts))
+    return table
 
 
 def _parts(table: Table, width: int) -> list[Table]:
@@ -137,7 +153,7 @@ def _parts(table: Table, width: int) -> list[Table]:
 def _natural_width(table: Table) -> int:
     """Return the characters that a table needs without wrapping a cell."""
     widths = _widths(_cells(table))
-    return sum(widths) + 3 * len(widths)
+    return sum(widths) + GAP * len(widths)
 
 
 def _cells(table: Table) -> list[list[str]]:
@@ -157,7 +173,7 @@ def _widths(cells: list[list[str]]) -> list[int]:
 
 
 def _show_stacked(table: Table, out: Console) -> None:
-    """Print every row as a heading and one line a column, so that the narrowest terminal loses no digit."""
+    """Print every row as a heading and one line per column, so that the narrowest terminal loses no digit."""
     out.print(Text(table.title, "bold"))
     for row in table.rows:
         first, *rest = zip(table.columns, row, strict=True)
@@ -166,7 +182,8 @@ def _show_stacked(table: Table, out: Console) -> None:
             cell = column.text(value)
             if cell not in ("", "-"):
                 unit = f" {column.unit}" if column.unit else ""
-                out.print(Text(f"  {column.name or 'note'} {cell}{unit}"))
+                text = wrapped(f"{column.name or 'note'} {cell}{unit}", out.width, "  ", "    ")
+                out.print(Text(text), soft_wrap=True)
 
 
 def _drawn(table: Table, out: Console) -> Text:
@@ -181,10 +198,10 @@ def _drawn(table: Table, out: Console) -> Text:
             gap + cell if column.format else cell + gap
             for cell, gap, column in zip(row, gaps, table.columns, strict=True)
         ]
-        lines.append(f"  {'   '.join(padded)}".rstrip())
+        lines.append(f"  {(' ' * GAP).join(padded)}".rstrip())
     heads = len(cells) - len(table.rows)
     line = "\u2500" if out.encoding.lower().startswith("utf") else "-"
-    rule = " " + line * (sum(widths) + 3 * len(widths) - 1)
+    rule = " " + line * (sum(widths) + GAP * len(widths) - 1)
     title = [table.title, ""] if table.title else []
     head, body = "\n".join([*title, *lines[:heads]]), "\n".join([rule, *lines[heads:], ""])
     return Text.assemble((head, "bold"), "\n", body, no_wrap=True, overflow="ignore")

@@ -17,6 +17,7 @@ from accelcal_cli.detection.capture import NEAR, Capture, CapturedPose, CaptureS
 from accelcal_cli.output.console import console
 from accelcal_cli.output.files import check_target, is_stream, open_stream, unwritten, whole_file
 from accelcal_cli.sensor.poses import describe
+from accelcal_cli.views.blocks import wrapped
 
 BAR = 20
 WORDS = {
@@ -44,7 +45,8 @@ class Watch:
         if self.live:
             self.live.start()
         elif not self.quiet:
-            self.out.print(f"{len(self.capture.planned)} poses to take, in any order; each held still:")
+            heading = f"{len(self.capture.planned)} poses to take, in any order; each held still:"
+            self.out.print(wrapped(heading, self.out.width), soft_wrap=True)
             for direction in self.capture.planned:
                 self.out.print(f"  {describe(direction)}")
         return self
@@ -65,7 +67,7 @@ class Watch:
         if self.live:
             self.out.bell()
         else:
-            self.out.print(self._taken())
+            self.out.print(wrapped(self._taken(), self.out.width, "", "  "), soft_wrap=True)
 
     def _taken(self) -> str:
         """Return the line of the latest pose."""

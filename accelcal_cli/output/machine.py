@@ -88,14 +88,14 @@ def write_table(table: Table, path: str) -> None:
     """
     with whole_file(path, binary=path.endswith(".parquet")) as file:
         if path.endswith(".parquet"):
-            _frame(table).write_parquet(file)
+            frame(table).write_parquet(file)
         elif path.endswith(".json"):
             file.write(json_text(json_rows([table])))
         else:
             write_csv(table, file)
 
 
-def _frame(table: Table) -> polars.DataFrame:
+def frame(table: Table) -> polars.DataFrame:
     """Return a table as polars columns: text, 64-bit integers or 64-bit floats by their format."""
     import polars
 
@@ -113,6 +113,13 @@ def _frame(table: Table) -> polars.DataFrame:
 
 def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def result_text(result: Calibration, *, json: bool) -> str:
+    """Return what the result file of a calibration holds, as JSON or YAML."""
+    from accelcal_cli.config import dump
+
+    return json_text(result.record()) if json else dump(result.record())
 
 
 FORBIDDEN = '/\\:*?"<>|%'

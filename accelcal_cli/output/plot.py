@@ -6,7 +6,7 @@ All have one style, and the same data give the same file.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from accelcal_cli.arrays import Float
+from accelcal_cli.calibration.observability import BIAS, MISALIGNMENT, SCALE
+from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.detection.detect import Detection
+from accelcal_cli.io.clock import UNITS
 from accelcal_cli.navigation.study import BOUND, INS
 from accelcal_cli.output.files import whole_file
 from accelcal_cli.studies.study import Curves
@@ -103,11 +106,8 @@ def _panel(
             va="bottom",
         )
     axes.set_title(name, fontsize=10)
-    axes.set(yscale="log", xlabel="evaluations", ylabel="median best cost")
+    axes.set(xscale="log", yscale="log", xlabel="evaluations", ylabel="median best cost")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
-    axes.ticklabel_format(axis="x", style="plain")
-    axes.locator_params(axis="x", integer=True)
-    axes.xaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -162,15 +162,55 @@ def plot_log(detection: Detection, path: str) -> None:
         axes = figure.subplots()
         poses = detection.intervals  # first and last abscissa of each, shape (I, 2)
         edges: Float = np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
-        _log(axes, detection)
+        label, place = _abscissa(detection)
+        edges = place(edges)
+        _log(axes, detection, place)
         _shade(axes, edges)
+        if label == CLOCK:
+            _date_ticks(axes)
         axes.set_title(
             f"{Path(detection.source).name}: {len(edges)} static poses, multiplier {detection.multiplier:g}",
             fontsize=11,
             pad=14,
         )
-        axes.set(xlabel="row" if poses.time is None else "time", ylabel="output, sensor units")
+        axes.set(xlabel=label, ylabel=f"output [{detection.form.unit or 'output units'}]")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+
+
+CLOCK = "time of day"
+EPOCH = (1e9, 4e9)
+"""Seconds since 1970 that are a date of our time rather than the age of a log."""
+
+SCALES = ((7200.0, 3600.0, "h"), (300.0, 60.0, "min"), (0.0, 1.0, "s"))
+"""Seconds that a log lasts at least, and the unit that its time is drawn in."""
+
+
+def _abscissa(detection: Detection) -> tuple[str, Callable[[Float], Float]]:
+    """Return what the horizontal axis shows, and how times of the log become places on it.
+
+    Rows where there is no time, the time of day where there are dates, else seconds, minutes or hours.
+    """
+    time = detection.intervals.time
+    if time is None:
+        return "row", lambda rows: rows
+    unit = UNITS[detection.time_unit]
+    first, last = float(time[0, 0]) * unit, float(time[-1, 1]) * unit
+    began = detection.began
+    if began is None and EPOCH[0] < first < EPOCH[1]:
+        began = np.datetime64(0, "s")
+    if began is not None:
+        start = began.astype("datetime64[us]").astype(np.int64) / 86400e6  # days, as matplotlib counts them
+        return CLOCK, lambda times: np.asarray(start + times * (unit / 86400.0))
+    size, name = next((size, name) for least, size, name in SCALES if last - first >= least)
+    return f"time [{name}]", lambda times: times * (unit / size)
+
+
+def _date_ticks(axes: Axes) -> None:
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+    locator = AutoDateLocator()  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
 
 
 def _shade(axes: Axes, edges: Float) -> None:
@@ -184,11 +224,12 @@ def _shade(axes: Axes, edges: Float) -> None:
             axes.annotate(str(k + 1), place, xycoords=at, ha="center", va="bottom", fontsize=6)
 
 
-def _log(axes: Axes, detection: Detection) -> None:
+def _log(axes: Axes, detection: Detection, place: Callable[[Float], Float]) -> None:
     """Draw each axis as the band between its least and greatest value in each bin."""
     if detection.envelope is None:
         return
     at, low, high = detection.envelope.bins()
+    at = place(at)
     for k, axis in enumerate("xyz"):
         name = detection.columns[k]
         label = axis if name.isdigit() else name
@@ -196,6 +237,67 @@ def _log(axes: Axes, detection: Detection) -> None:
             at, low[:, k], high[:, k], step="post", color=COLOURS[k], alpha=0.9, linewidth=0.6, label=label
         )
     axes.margins(x=0.01)
+
+
+def _axes(axes: Axes | None) -> Axes:
+    """Return axes to draw on: those given, or those of a new figure that notebooks show."""
+    if axes is not None:
+        return axes
+    from matplotlib import pyplot
+
+    _, new = pyplot.subplots(layout="constrained")
+    new.spines[["top", "right"]].set_visible(False)
+    return new
+
+
+def residuals(result: Calibration, axes: Axes | None = None) -> Axes:
+    """Draw |f| - g of every kept pose before and after calibration; poses are numbered from 1, as in tables."""
+    axes = _axes(axes)
+    poses = [fit.pose + 1 for fit in result.poses_fit]
+    for colour, label, values in (
+        (COLOURS[1], "before", [fit.residual_before for fit in result.poses_fit]),
+        (COLOURS[0], "after", [fit.residual for fit in result.poses_fit]),
+    ):
+        axes.plot(poses, values, "o", color=colour, markersize=4, label=label)
+    named = [fit for fit in result.poses_fit if fit.pose in result.outliers]
+    if named:
+        places = [fit.pose + 1 for fit in named], [fit.residual for fit in named]
+        axes.plot(*places, "X", color=COLOURS[6], markersize=8, label="outlier")
+    axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+    axes.set(xlabel="pose", ylabel=f"|f| - g [{result.unit}]")
+    axes.margins(y=0.1)
+    axes.set_yscale("symlog", linthresh=max(result.s, 1e-12) if result.freedom > 0 else 1e-3)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    return axes
+
+
+def search(result: Calibration, axes: Axes | None = None) -> Axes:
+    """Draw the best cost so far against the evaluations, on logarithmic axes."""
+    axes = _axes(axes)
+    points = [(evaluations, cost) for evaluations, cost in result.convergence if cost > 0]
+    if points:
+        axes.plot(*zip(*points, strict=True), **line_style(0))
+        axes.set(xscale="log", yscale="log")
+    axes.set(xlabel="evaluations", ylabel=f"best cost L [({result.unit})^4]", title=result.optimizer)
+    return axes
+
+
+def intervals(result: Calibration, axes: Axes | None = None) -> Axes:
+    """Draw the nine parameters with their 95 % intervals, each divided by the largest of its kind."""
+    axes = _axes(axes)
+    values, sigma = result.engineering
+    half = result.interval_of(sigma)
+    for k, (name, part) in enumerate((("scale", SCALE), ("misalignment", MISALIGNMENT), ("bias", BIAS))):
+        largest = float(np.abs(values[part]).max()) or 1.0
+        at = np.arange(3) + 4 * k
+        spread = np.nan_to_num(half[part]) / largest
+        axes.errorbar(at, values[part] / largest, spread, color=COLOURS[k], capsize=3, fmt="o", label=name)
+    axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
+    axes.set_xticks([k for k in range(11) if k % 4 < 3], ["x", "y", "z", "xy", "xz", "yz", "x", "y", "z"])
+    axes.set(ylabel="value / largest of its kind")
+    axes.margins(y=0.1)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    return axes
 
 
 HOUR = 3600.0

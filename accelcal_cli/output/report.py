@@ -12,6 +12,7 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,9 +20,10 @@ import numpy as np
 from accelcal_cli import __version__
 from accelcal_cli.arrays import Float
 from accelcal_cli.calibration.observability import UNDETERMINED, WEAK
-from accelcal_cli.calibration.result import Calibration, PoseFit
+from accelcal_cli.calibration.result import Calibration, PoseFit, load_result
 from accelcal_cli.config import dump
 from accelcal_cli.errors import UsageError
+from accelcal_cli.output.files import whole_file
 from accelcal_cli.views import calibration as tables
 
 if TYPE_CHECKING:
@@ -37,7 +39,34 @@ RAISED = (("m/s^2", "m/s\u00b2"), (")^4", ")\u2074"), ("(g)\u2074", "g\u2074"))
 def check_packages() -> None:
     """Raise UsageError when a package that only reports need is missing."""
     if any(importlib.util.find_spec(name) is None for name in NEEDS):
-        raise UsageError("a report needs jinja2 and matplotlib: pip install 'accelcal[report]'")
+        raise UsageError("a report needs jinja2 and matplotlib: python -m pip install jinja2 matplotlib")
+
+
+def report(
+    result: Calibration | str | Path, output: str | Path | None = None, *, title: str | None = None
+) -> str:
+    """Return a report of a result, one HTML page with pictures, and write it where a name is given.
+
+    Args:
+        result: the calibration, or its file; output: file to write, whole or not at all; title: heading of the page.
+
+    Raises:
+        UsageError: jinja2 or matplotlib is missing. OutputError: it cannot be written.
+
+    Examples:
+        >>> from accelcal_cli import calibrate, report, simulate
+        >>> page = report(calibrate(simulate("mems", positions=24).output), title="Desk 1")
+        >>> "Desk 1" in page
+        True
+    """
+    check_packages()
+    calibration = result if isinstance(result, Calibration) else load_result(result)
+    source = Path(str(calibration.data.get("source", "the readings"))).name
+    text = page(calibration, title or f"Calibration of {source}")
+    if output is not None:
+        with whole_file(str(output), binary=True) as file:
+            file.write(text.encode())  # the page says that it is UTF-8, whatever the terminal takes
+    return text
 
 
 def page(result: Calibration, title: str) -> str:

@@ -211,3 +211,42 @@ def normal_gravity(latitude: float, height: float = 0.0) -> float:
         warnings.simplefilter("ignore", UserWarning)
         milligal = boule.WGS84.normal_gravity((0.0, latitude, height))
     return float(milligal) * 1e-5
+
+
+def local_gravity(
+    unit: str | None = None,
+    *,
+    g: float | None = None,
+    latitude: float | None = None,
+    height: float | None = None,
+) -> float | None:
+    """Return the stated local gravity in the unit of the readings, or None where nothing decides it.
+
+    Readings in units of g or mg have 1 or 1000 where nothing is stated, which is as good as the 9.80665 of others. What
+    `g` states is taken as it is: the user knows the unit.
+
+    Args:
+        unit: of the readings, as their file states it; None where it does not.
+        g: gravity in m/s^2, or in the unit of the readings.
+        latitude, height: degrees, and metres above the ellipsoid, in place of g.
+
+    Raises:
+        UsageError: out of range, stated twice, or a height without a latitude.
+
+    Examples:
+        >>> local_gravity("g")
+        1.0
+        >>> round(local_gravity(latitude=48.1, height=500), 5)
+        9.80746
+    """
+    if g is not None and latitude is not None:
+        raise UsageError("--g and --latitude: expected one of them, not both")
+    if height is not None and latitude is None:
+        raise UsageError("--height needs --latitude")
+    if g is not None:
+        return check_gravity(g)
+    metres = None if latitude is None else normal_gravity(latitude, height or 0.0)
+    if unit not in ("g", "mg"):
+        return metres
+    size = OUTPUT_OF_1_G[unit]
+    return size if metres is None else metres * size / STANDARD_GRAVITY

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 
@@ -17,7 +18,11 @@ from accelcal_cli.config import load_mapping, shipped
 from accelcal_cli.errors import ConfigError, did_you_mean
 from accelcal_cli.rng import Purpose, Streams
 from accelcal_cli.schema import Checked, from_mapping, setting
-from accelcal_cli.sensor.model import ErrorModel
+from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
+from accelcal_cli.sensor.poses import directions
+
+if TYPE_CHECKING:
+    import polars
 
 HOLD_SPREAD = 0.2
 """Holds last up to this part longer or shorter than stated."""
@@ -102,6 +107,13 @@ class SimulatedReadings:
     output: Float
     force: Float
 
+    def to_frame(self) -> polars.DataFrame:
+        """Return the samples as a frame of polars that `calibrate` takes: columns pose, Nx, Ny, Nz."""
+        import polars
+
+        columns = dict(zip(("Nx", "Ny", "Nz"), np.ascontiguousarray(self.output.T), strict=True))
+        return polars.DataFrame({"pose": self.pose, **columns})
+
 
 def draw(sensor: Sensor, runs: Sequence[int], seed: int) -> ErrorModel:
     """Return sensors of one type, one per run: K of shape (R, 3, 3), D of shape (R, 3).
@@ -121,18 +133,83 @@ def draw(sensor: Sensor, runs: Sequence[int], seed: int) -> ErrorModel:
     return ErrorModel(scale[..., None] * turned, scale * sensor.spread.bias * z[:, 3])
 
 
-def simulate(sensor: Sensor, u: Float, g: float, samples: int, noise: float, seed: int) -> SimulatedReadings:
-    """Return what a sensor at rest reads.
+@overload
+def simulate(
+    sensor: Sensor | str = ...,
+    u: Float | None = ...,
+    g: float = ...,
+    samples: int = ...,
+    noise: float | None = ...,
+    seed: int = ...,
+    *,
+    positions: int = ...,
+    scheme: str | None = ...,
+    raw: Literal[False] = ...,
+) -> SimulatedReadings: ...
+
+
+@overload
+def simulate(
+    sensor: Sensor | str = ...,
+    u: Float | None = ...,
+    g: float = ...,
+    samples: int = ...,
+    noise: float | None = ...,
+    seed: int = ...,
+    *,
+    positions: int = ...,
+    scheme: str | None = ...,
+    raw: Literal[True],
+    **handling: float,
+) -> polars.DataFrame: ...
+
+
+def simulate(
+    sensor: Sensor | str = "dpso",
+    u: Float | None = None,
+    g: float = STANDARD_GRAVITY,
+    samples: int = 1,
+    noise: float | None = None,
+    seed: int = 0,
+    *,
+    positions: int = 12,
+    scheme: str | None = None,
+    raw: bool = False,
+    **handling: float,
+) -> SimulatedReadings | polars.DataFrame:
+    """Return what a sensor at rest reads, or with `raw` the log of a sensor that is held and turned.
 
     Args:
-        sensor: the sensor.
-        u: unit directions of the specific force, shape (J, 3).
+        sensor: the sensor, or the name of a shipped one, or the path of its file.
+        u: unit directions of the specific force, shape (J, 3); those of `positions` and `scheme` when None.
         g: local gravity, m/s^2.
         samples: samples of each pose.
-        noise: one sigma of one sample and axis, m/s^2.
-        seed: of the noise.
+        noise: one sigma of one sample and axis, m/s^2; the sensor's when None.
+        seed: of everything random.
+        positions: number of poses J; scheme: where they point, see `directions`.
+        raw: return a log as a frame of polars, columns t, ax, ay, az; handling: fields of `Handling`.
+
+    Raises:
+        ConfigError: no such sensor. UsageError: no such scheme.
+
+    Examples:
+        >>> from accelcal_cli import simulate
+        >>> simulate("mems", positions=24, samples=10).output.shape
+        (240, 3)
+        >>> simulate("mems", positions=3, raw=True, hold=1.0, move=0.5).columns
+        ['t', 'ax', 'ay', 'az']
     """
-    return _readings(sensor.model, u, g, samples, noise, Streams(seed, [0], Purpose.NOISE))
+    device = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    if u is None:
+        u = directions(positions, scheme, Streams(seed, [0], Purpose.ATTITUDE).normal(positions, 3)[0])
+    sigma = device.noise if noise is None else noise
+    if not raw:
+        return _readings(device.model, u, g, samples, sigma, Streams(seed, [0], Purpose.NOISE))
+    import polars
+
+    segments = simulate_log(device, u, g, from_mapping(Handling, handling, "simulate"), sigma, seed)
+    rows = np.concatenate([np.column_stack([part.time, part.output]) for part in segments])
+    return polars.DataFrame(rows, schema=["t", "ax", "ay", "az"])
 
 
 def simulate_fleet(

@@ -96,7 +96,7 @@ def cluster(address: str) -> Iterator[Executor]:
         from distributed.comm.addressing import get_address_host_port
         from distributed.scheduler import KilledWorker
     except ImportError:
-        raise DataError("--cluster needs dask: pip install 'accelcal[cluster]'") from None
+        raise DataError("--cluster needs dask: python -m pip install distributed") from None
     where = f"--cluster {address}"
     try:
         # A client with an address that is none fails too, but is heard once more when it is collected.

@@ -10,8 +10,9 @@ parameters (`shift.Shift`); each parameter alone, all determined directions toge
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -23,10 +24,10 @@ from accelcal_cli.calibration.assess import is_large, large_residuals, not_fitti
 from accelcal_cli.calibration.distributions import Noise, Pair
 from accelcal_cli.calibration.observability import PARAMETERS, design, unit
 from accelcal_cli.calibration.residuals import beyond_chance, leverages, room_of, studentise
-from accelcal_cli.calibration.result import Calibration
+from accelcal_cli.calibration.result import Calibration, load_result
 from accelcal_cli.calibration.sample import Sample, length_error
 from accelcal_cli.errors import DataError
-from accelcal_cli.io.readings import Readings
+from accelcal_cli.io.readings import Data, Readings, read_readings
 from accelcal_cli.notices import Notice, are_serious
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY, ErrorModel
@@ -141,20 +142,37 @@ class Verification:
 
 
 def verify(
-    old: Calibration, readings: Readings, level: float = 0.05, tolerance: float | None = None
+    old: Calibration | str | Path,
+    readings: Data,
+    level: float = 0.05,
+    tolerance: float | None = None,
+    *,
+    columns: Sequence[str] | None = None,
 ) -> Verification:
     """Compare a result with new readings of the sensor.
 
     Args:
-        old: the result.
-        readings: J static poses, in the unit of the readings that the result was made from.
+        old: the result, or its file.
+        readings: J static poses, in the unit of the readings that the result was made from; see `read_readings`.
         level: chance of calling an unchanged sensor changed.
         tolerance: largest rms of |f| - g, m/s^2, or None.
+        columns: see `read_readings`.
 
     Raises:
         DataError: the result states no uncertainty, so that there is nothing to compare with; or no reading is near g
             under it, as in another unit.
+
+    Examples:
+        >>> from accelcal_cli import calibrate, simulate, verify
+        >>> old = calibrate(simulate("mems", positions=24, seed=1).output)
+        >>> verify(old, simulate("mems", positions=24, seed=2).output).verdict
+        'unchanged'
     """
+    old = old if isinstance(old, Calibration) else load_result(old)
+    return _verified(old, read_readings(readings, columns), level, tolerance)
+
+
+def _verified(old: Calibration, readings: Readings, level: float, tolerance: float | None) -> Verification:
     _check(old)
     reference = at_reference(old, readings)
     readings = reference.readings

@@ -5,6 +5,8 @@ The views of each kind of result return such blocks in reading order; `output.co
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -139,3 +141,38 @@ def convergence(name: str, curves: Mapping[str, tuple[Float, Float]], least: flo
     """Return the median convergence of optimizers on one function or problem."""
     points = {label: list(zip(n.tolist(), cost.tolist(), strict=True)) for label, (n, cost) in curves.items()}
     return Convergence(f"{name}: median cost so far, logarithmic", points, least)
+
+
+UNITS = (
+    "%|ppm|mrad|micro-g|micro-rad|arcsec|m/s\\^2|m/s²|mg|g|mGal|Hz|s|ms|sigma|degrees?|rows?|poses?|readings?|sensors?|"
+    "attitudes?|logs?|runs?|evaluations|seconds?|output units|units per"
+)
+TOGETHER = re.compile(
+    rf"(?<=[\d)]) (?=(?:{UNITS})(?![\w^-]))|(?<=\bper) (?=m/s)|(?<=[<>=±]) (?=[-+\d])"
+    r"|(?<=\d) (?=±)|(?<=\b[pg]) (?=[<=])"
+)
+"""Blanks that no line ends at: between a number and its unit, or a sign and its number."""
+
+KEPT = "\u00a0"
+
+
+def wrapped(text: str, width: int, indent: str = "", further: str | None = None) -> str:
+    """Return a text in lines of a width, none of which ends between a number and its unit.
+
+    Args:
+        text: words; width: characters of a line.
+        indent: what the first line begins with, and the others unless `further` says.
+
+    >>> print(wrapped("the noise of one pose is 0.35 m/s^2", 30))
+    the noise of one pose is
+    0.35 m/s^2
+    """
+    lines = textwrap.wrap(
+        TOGETHER.sub(KEPT, text),
+        max(width, 20),
+        initial_indent=indent,
+        subsequent_indent=indent if further is None else further,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join(lines).replace(KEPT, " ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -17,7 +18,8 @@ from accelcal_cli.calibration.observability import (
 from accelcal_cli.calibration.result import Calibration, Temperature, Worn
 from accelcal_cli.sensor import model as units
 from accelcal_cli.sensor.poses import AXES
-from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Convergence, Table, notes
+from accelcal_cli.views import quoted
+from accelcal_cli.views.blocks import BLANK, Block, Column, Conclusion, Convergence, Paragraph, Table, notes
 
 KINDS = (
     ("scale", SCALE, "ppm", units.PPM),
@@ -33,13 +35,6 @@ WORST_SHOWN = 5
 INTERVAL = "+- 95 %"
 """Heading of the half-widths of 95 % intervals."""
 
-UNKNOWN, ASSUMED = "not determined", "taken as 0"
-
-
-def tables(result: Calibration) -> list[Table]:
-    """Return every table of a result, in reading order."""
-    return [*parameter_tables(result), fit(result), observability(result), worst_poses(result)]
-
 
 def parameter_tables(result: Calibration) -> list[Table]:
     """Return the parameters in the paper's units, in an engineer's, against temperature, and what GGIR says of wear."""
@@ -49,11 +44,40 @@ def parameter_tables(result: Calibration) -> list[Table]:
 
 
 def blocks(result: Calibration) -> list[Block]:
-    """Return what a calibration shows: verdict first, then tables, notes and convergence."""
+    """Return all there is to show of a calibration: what fits on a screen first, then each pose and the search."""
     title = f"Convergence of {result.optimizer} (best cost L so far, logarithmic)"
     curve = [Convergence(title, {"": result.convergence})] if len(result.convergence) > 1 else []
     conclusion = Conclusion(result.verdict, result.reasons, result.warnings)
-    return [conclusion, BLANK, *tables(result), *notes(result.notes), *curve]
+    tables = [quoted.parameters(result), quoted.engineering(result), fit(result), observability(result)]
+    last = Paragraph(f": {quoted.summary(result)}.", result.verdict)
+    return [conclusion, BLANK, *tables, every_pose(result), *notes(result.notes), *curve, last]
+
+
+def every_pose(result: Calibration) -> Table:
+    """Return every kept pose: residual before and after calibration, and whether it is an outlier."""
+    unit = result.unit
+    columns = (
+        Column("pose", format="d"),
+        Column("where"),
+        Column("before", unit, ".1e"),
+        Column("after", unit, ".1e"),
+        Column("studentised", format=".2f"),
+        Column("leverage", format=".2f"),
+        Column(""),
+    )
+    rows = tuple(
+        (
+            p.pose + 1,
+            p.where,
+            p.residual_before,
+            p.residual,
+            p.studentised,
+            p.leverage,
+            "outlier" if p.pose in result.outliers else "",
+        )
+        for p in result.poses_fit
+    )
+    return Table("Poses, |f| - g before and after calibration", columns, rows).filled()
 
 
 def parameters(result: Calibration) -> Table:
@@ -88,29 +112,21 @@ def parameters(result: Calibration) -> Table:
 def _pair(value: float, interval: float, *, lost: bool) -> list[object]:
     """Return a value and its interval, or that the poses do not determine it."""
     if lost:
-        return [UNKNOWN, None]
+        return [quoted.UNKNOWN, None]
     return [value, interval if np.isfinite(interval) else None]
 
 
 def engineering(result: Calibration) -> Table:
     """Return scale-factor errors, misalignments and biases, each in the two units that engineers use."""
-    # A result in units of g counts the bias in g already; one in m/s^2 is divided by the local g for micro-g.
-    force = result.unit in ("g", "mg")  # in units of g, not in metres
-    metres = units.STANDARD_GRAVITY / units.OUTPUT_OF_1_G[result.unit]
-    per_g = units.OUTPUT_OF_1_G[result.unit] if force else result.g
-    values, sigma = result.engineering
-    values[BIAS] /= per_g
-    interval = result.interval_of(sigma)
-    interval[BIAS] /= per_g
-    kinds = (
-        ("scale factor error", "ppm", units.PPM, "%", 100.0),
-        ("misalignment", "mrad", units.MRAD, "arcsec", units.ARCSEC),
-        ("bias", "micro-g", units.MICRO_G, "m/s^2", metres * per_g),
-    )
-    rows = []
+    values, interval = quoted.in_parts(result)
+    kinds, rows = quoted.kinds(result), []
     for p, name in enumerate(PARAMETERS):
         kind, unit, factor, second, second_factor = kinds[p // 3]
-        pair = [ASSUMED, None] if result.held[p] else _pair(values[p], interval[p], lost=bool(result.lost[p]))
+        pair = (
+            [quoted.ASSUMED, None]
+            if result.held[p]
+            else _pair(values[p], interval[p], lost=bool(result.lost[p]))
+        )
         first, other = ([_times(cell, f) for cell in pair] for f in (factor, second_factor))
         rows.append((f"{kind} {name.split()[-1]}", *first, unit, *other, second))
     columns = (
@@ -122,25 +138,12 @@ def engineering(result: Calibration) -> Table:
         Column(INTERVAL, format=",.3g", key="interval_2", beside=True),
         Column("unit", key="unit_2", beside=True),
     )
-    return Table("Engineering view", columns, tuple(rows), (_reference(result),))
+    return Table("Engineering view", columns, tuple(rows), (quoted.reference(result),))
 
 
 def _times(cell: object, factor: float) -> object:
     """Return a number times a factor; words and nothing as they are."""
     return cell * factor if isinstance(cell, float) else cell
-
-
-def _reference(result: Calibration) -> str:
-    """Return the sentence that says what the engineering numbers are relative to."""
-    nominal = f"{result.nominal_scale[0]:.6g}"
-    if np.ptp(result.nominal_scale) > 0:
-        nominal = ", ".join(f"{k:.6g}" for k in result.nominal_scale)
-    offset = ", ".join(f"{d:g}" for d in result.nominal_bias) if result.nominal_bias.any() else "0"
-    return (
-        f"Scale factor: sensitivity of the axis. Errors against {nominal} output units per {result.unit}, biases, as "
-        f"force along the axis, against {offset} output units. "
-        "Misalignment: the angle by which two sensor axes miss 90 degrees."
-    )
 
 
 def temperature(result: Calibration, slopes: Temperature) -> Table:
@@ -232,7 +235,7 @@ def observability(result: Calibration) -> Table:
     for (name, dop), held in zip(result.geometry.parameters.items(), result.held, strict=True):
         word = "undetermined" if dop > UNDETERMINED else "weak" if dop > WEAK else "good"
         size = dop if np.isfinite(dop) else "infinite"
-        rows.append((name, "-", ASSUMED) if held else (name, size, word))
+        rows.append((name, "-", quoted.ASSUMED) if held else (name, size, word))
     notes = (
         "Dilution of precision: parameter error divided by the noise of one pose "
         f"(as {result.unit} at 1 g), of the distinct attitudes; more than twelve count as twelve of their kind. Above "
@@ -248,6 +251,7 @@ def worst_poses(result: Calibration) -> Table:
     order = np.argsort(-np.array(size), kind="stable")[:WORST_SHOWN]
     rows = tuple(
         (
+            p.pose + 1,
             p.where,
             p.residual,
             p.studentised,
@@ -259,7 +263,8 @@ def worst_poses(result: Calibration) -> Table:
     )
     unit = result.unit
     columns = (
-        Column("pose"),
+        Column("pose", format="d"),
+        Column("where"),
         Column("|f| - g", unit, ".3e"),
         Column("studentised", format=".2f"),
         Column("leverage", format=".2f"),
@@ -267,6 +272,15 @@ def worst_poses(result: Calibration) -> Table:
         Column(""),
     )
     return Table("Worst poses", columns, rows)
+
+
+def numbers(result: Calibration) -> Table:
+    """Return one row per parameter and number, for frames; one that is not determined has no value."""
+    whole = values(result)
+    columns = tuple(
+        replace(column, format="g") if 0 < k < 4 else column for k, column in enumerate(whole.columns)
+    )
+    return Table(whole.title, columns, tuple(row for row in whole.rows if row[0] != "verdict"))
 
 
 def values(result: Calibration) -> Table:
@@ -319,7 +333,8 @@ def pose_residuals(result: Calibration) -> Table:
     """Return every kept pose: residual before and after calibration, and the direction that pointed up."""
     unit = result.unit
     columns = (
-        Column("pose"),
+        Column("pose", format="d"),
+        Column("where"),
         Column("before", unit, ".3e"),
         Column("after", unit, ".3e"),
         Column("studentised", format=".2f"),
@@ -327,7 +342,7 @@ def pose_residuals(result: Calibration) -> Table:
         *(Column(axis, format=".3f") for axis in AXES),
     )
     rows = tuple(
-        (p.where, p.residual_before, p.residual, p.studentised, p.leverage, *p.direction)
+        (p.pose + 1, p.where, p.residual_before, p.residual, p.studentised, p.leverage, *p.direction)
         for p in result.poses_fit
     )
     notes = ("Before, after: |f| - g. x, y, z: unit direction of the specific force, gauge lower.",)

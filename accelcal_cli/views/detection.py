@@ -11,34 +11,67 @@ import numpy as np
 from accelcal_cli.detection.detect import Detection
 from accelcal_cli.schema import to_mapping
 from accelcal_cli.sensor.model import STANDARD_GRAVITY
-from accelcal_cli.views.blocks import Block, Column, Table, notes
+from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table, notes
 
 SCHEMA = "accelcal/detection/1"
 """Name and version of the record."""
 
 
-MOST = 60
-"""Poses that are shown to people; more are in the file of -o."""
+MOST = 24
+"""Poses that one screen shows; all with --verbose, and in the file of -o."""
 
 
-def blocks(detection: Detection) -> list[Block]:
-    """Return what a detection shows: poses, the thresholds tried, notes."""
-    poses = poses_table(detection)
-    if len(poses.rows) > MOST:
-        note = f"{len(poses.rows) - MOST:,} more poses are not shown; -o writes them all"
-        poses = replace(poses, rows=poses.rows[:MOST], notes=(note,))
-    return [poses, candidates_table(detection), *notes((*detection.notes, detection.summary()))]
+def blocks(detection: Detection, verbose: bool = False) -> list[Block]:
+    """Return what a detection shows: poses, notes, and with `verbose` the thresholds tried."""
+    poses = shown_poses(detection)
+    if len(poses.rows) > MOST and not verbose:
+        note = f"{len(poses.rows) - MOST:,} more poses are not shown; --verbose shows them, -o writes them."
+        poses = replace(poses, rows=poses.rows[:MOST], notes=(*poses.notes, note))
+    tried = [candidates_table(detection)] if verbose else []
+    last = Paragraph(detection.summary())
+    return [poses, *([] if poses.notes else [BLANK]), *tried, *notes(detection.notes), last]
+
+
+def shown_poses(detection: Detection) -> Table:
+    """Return one row per pose for people: from when to when, rows, mean, noise, temperature."""
+    poses = detection.intervals
+    timed = poses.time is not None
+    edges = np.stack([poses.start, poses.end], axis=1) if poses.time is None else poses.time
+    columns = [
+        Column("pose", format="d"),
+        Column("start", "" if timed else "row", ".8g" if timed else ","),
+        Column("end", "" if timed else "row", ".8g" if timed else ","),
+        Column("rows", format=","),
+        *(Column(f"N{axis}", format=".7g") for axis in "xyz"),
+        Column("sd", format=".3g"),
+    ]
+    spread = np.sqrt((poses.scatter**2).mean(axis=1))
+    numbers = [edges, poses.n[:, None], poses.mean, spread[:, None]]
+    if poses.temperature is not None:
+        columns.append(Column("T", format=".6g"))
+        numbers.append(poses.temperature[:, None])
+    kinds = [int] * 2 if not timed else [float] * 2
+    rows = tuple(
+        (k, kinds[0](row[0]), kinds[1](row[1]), int(row[2]), *row[3:])
+        for k, row in enumerate(np.hstack(numbers).tolist(), 1)
+    )
+    unit = "start and end in the unit of the time column, " if timed else ""
+    note = f"{unit}N: mean output; sd: standard deviation of one reading, rms of the axes."
+    return Table(f"Static poses of {detection.source}", tuple(columns), rows, (note[:1].upper() + note[1:],))
 
 
 def poses_table(detection: Detection) -> Table:
     """Return one row per pose: rows, count, mean, standard deviation, times, temperature, as `calibrate` reads it."""
     poses = detection.intervals
     columns = [
+        Column("pose", format="d"),
         *(Column(name, format=",") for name in ("start", "end", "n")),
         *(Column(f"N{axis}", format=".8g") for axis in "xyz"),
         *(Column(f"s{axis}", format=".3g") for axis in "xyz"),
     ]
-    rows = np.column_stack([poses.start, poses.end, poses.n]).astype(int).tolist()
+    rows = (
+        np.column_stack([np.arange(1, len(poses) + 1), poses.start, poses.end, poses.n]).astype(int).tolist()
+    )
     values = [poses.mean, poses.scatter]
     if poses.time is not None:
         columns += [Column("t_start", format=".10g"), Column("t_end", format=".10g")]
@@ -56,10 +89,10 @@ def candidates_table(detection: Detection) -> Table:
     unit = "g" if detection.settings.g == 1.0 else "m/s^2"
     columns = (
         Column("multiplier", format="g"),
-        Column("threshold", "(output units)^2", ".4g"),
+        Column("threshold", "output^2", ".4g"),
         Column("poses", format=","),
         Column("attitudes", format=","),
-        Column("rms of |f| - g", unit, ".4g", key="rms"),
+        Column("rms", unit, ".4g"),
         Column("worst sigma", unit, ".4g", key="sigma"),
         Column("verdict"),
         Column(""),
@@ -77,7 +110,8 @@ def candidates_table(detection: Detection) -> Table:
         )
         for c in detection.candidates
     )
-    notes = () if detection.settings.g != STANDARD_GRAVITY else (f"at g = {STANDARD_GRAVITY}",)
+    at = f", at g = {STANDARD_GRAVITY} m/s^2" if detection.settings.g == STANDARD_GRAVITY else ""
+    notes = (f"rms: of |f| - g of a quick calibration{at}; worst sigma: of its parameters, at 1 g.",)
     return Table("Thresholds tried", columns, rows, notes)
 
 

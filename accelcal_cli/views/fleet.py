@@ -16,6 +16,9 @@ from accelcal_cli.views.blocks import BLANK, Block, Column, Paragraph, Table
 SHOWN = 10
 """Sensors of one kind that the summary names."""
 
+FEW_SHOWN = 5
+"""The same on one screen."""
+
 WORST = 5
 """Sensors with the largest rms that the summary names."""
 
@@ -89,30 +92,36 @@ def counts(fleet: Fleet) -> str:
     return f"{len(fleet.verdict):,} sensor{'s' * (len(fleet.verdict) != 1)}: {listed}{warnings}"
 
 
-def blocks(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Block]:
-    """Return what a fleet shows: how many sensors of each verdict, then what is worth knowing."""
-    shown: list[Block] = [Paragraph(heading=counts(fleet)), BLANK]
-    if fleet.determined.any():
-        shown += [_spread(fleet, g), _worst(fleet, labels, g)]
-    warned = np.flatnonzero(fleet.warned)
-    if len(warned):
-        shown.append(_warned(fleet, labels, warned, g))
-    if standouts:
-        shown.append(_standing_out(labels, standouts, g))
-    bad = np.flatnonzero(fleet.verdict != "good")
+def blocks(
+    fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float, verbose: bool = False
+) -> list[Block]:
+    """Return what a fleet shows: how many sensors of each verdict, which are not good, and how the fleet spreads.
+
+    With `verbose` also those with the largest residuals and with warnings, and more of each kind.
+    """
+    most, shown = SHOWN if verbose else FEW_SHOWN, [Paragraph(heading=counts(fleet)), BLANK]
+    tables = []
+    bad, warned = np.flatnonzero(fleet.verdict != "good"), np.flatnonzero(fleet.warned)
     if len(bad):
-        shown.append(_not_good(fleet, labels, bad))
-    return shown
+        tables.append(_not_good(fleet, labels, bad, most))
+    if standouts:
+        tables.append(_standing_out(labels, standouts, g, most))
+    if fleet.determined.any():
+        tables += [_spread(fleet, g), *([_worst(fleet, labels, g)] if verbose else [])]
+    if len(warned) and verbose:
+        tables.append(_warned(fleet, labels, warned, g))
+    last = "." if verbose else ". Worst fits and warnings: --verbose; a row for each sensor: --format csv"
+    return [*shown, *tables, Paragraph(counts(fleet) + last)]
 
 
 def _formats(g: float) -> dict[str, tuple[str, str]]:
     """Return unit and format of each quantity by its name, in the order in which they are shown."""
     force = "g" if g == 1.0 else "m/s^2"
-    kinds = [(f"units per {force}", ".7g"), ("mrad", ".3f"), ("micro-g", ",.1f")]
+    kinds = [(f"per {force}", ".6g"), ("mrad", ".2f"), ("micro-g", ",.0f")]
     return {
         **{name: kinds[p // 3] for p, name in enumerate(PARAMETERS)},
-        RMS_BEFORE: (force, ".4g"),
-        RMS_AFTER: (force, ".4g"),
+        RMS_BEFORE: (force, ".3g"),
+        RMS_AFTER: (force, ".3g"),
         NOISE: (force, ".3g"),
         WORST_DOP: ("", ".3f"),
     }
@@ -133,10 +142,14 @@ def _spread(fleet: Fleet, g: float) -> Table:
         values = values[np.isfinite(values)]
         if len(values):
             row = np.quantile(values, QUANTILES).tolist()
-            rows.append((name, *(format(v, spec) for v in row), unit))
-    columns = ("quantity", "least", "5 %", "median", "95 %", "greatest", "unit")
-    note = "Scale factors, misalignments and biases of the engineering view, of the sensors that their poses determine."
-    return Table("Fleet", tuple(Column(name) for name in columns), tuple(rows), (note,))
+            named = f"{name} [{unit}]" if unit else name
+            cells = [format(v, spec) for v in row]
+            rows.append((named, *cells))
+    columns = ("quantity", "least", "5 %", "median", "95 %", "most")
+    note = "Of the sensors that their poses determine; scale factors in output units."
+    numbers = [list(column) for column in zip(*rows, strict=True)]
+    aligned = [numbers[0], *([f"{cell:>{max(map(len, own))}}" for cell in own] for own in numbers[1:])]
+    return Table("Fleet", tuple(map(Column, columns)), tuple(zip(*aligned, strict=True)), (note,))
 
 
 def _worst(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
@@ -167,39 +180,37 @@ def _worst(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
     ]
     outlying = int((fleet.outlying != "").sum())
     note = f"Sensors with outliers: {outlying:,} (column outlying_poses of --format csv)."
-    return Table("Worst fit", columns, tuple(rows), (note,) if outlying else ())
+    return Table("Worst fit", columns, tuple(rows), (note,) if outlying else ()).filled()
 
 
-def _more(number: int, where: str = "") -> tuple[str, ...]:
+def _more(number: int, most: int, where: str = "") -> tuple[str, ...]:
     """Return a note of the sensors that are not shown, of a number of them."""
-    return (f"And {number - SHOWN:,} more{where}.",) if number > SHOWN else ()
+    return (f"And {number - most:,} more{where}.",) if number > most else ()
 
 
-def _standing_out(labels: Sequence[str], standouts: Sequence[Standout], g: float) -> Table:
+def _standing_out(labels: Sequence[str], standouts: Sequence[Standout], g: float, most: int) -> Table:
     """Return the sensors that stand out from the fleet."""
     formats = _formats(g)
     rows = tuple(
         (
             labels[one.at],
-            one.name,
+            f"{one.name} [{formats[one.name][0]}]" if formats[one.name][0] else one.name,
             *(format(value, formats[one.name][1]) for value in (one.value, one.middle)),
-            formats[one.name][0],
             one.z,
         )
-        for one in standouts[:SHOWN]
+        for one in standouts[:most]
     )
     columns = (
         Column("sensor"),
         Column("quantity"),
         Column("value"),
         Column("fleet"),
-        Column("unit"),
         Column("z", format="+.1f"),
     )
     note = (
         "z: distance from the median in standard deviations of the fleet, by its median absolute deviation."
     )
-    more = _more(len(standouts), " (column stands_out of --format csv)")
+    more = _more(len(standouts), most, " (column stands_out of --format csv)")
     return Table("Stand out from the fleet", columns, rows, (note, *more))
 
 
@@ -222,7 +233,7 @@ def _warned(fleet: Fleet, labels: Sequence[str], warned: Int, g: float) -> Table
         Column("outlying poses"),
         Column("warning"),
     )
-    return Table("Warnings", columns, rows, (note, *_more(len(warned))))
+    return Table("Warnings", columns, rows, (note, *_more(len(warned), SHOWN)))
 
 
 def _why(fleet: Fleet, r: int) -> str:
@@ -233,9 +244,9 @@ def _why(fleet: Fleet, r: int) -> str:
     return str(fleet.reason[r].partition(ADVICE)[0])
 
 
-def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int) -> Table:
+def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int, most: int) -> Table:
     """Return the sensors whose verdict is not good, the worst verdict first."""
     order = sorted(bad.tolist(), key=lambda r: -VERDICTS.index(fleet.verdict[r]))
-    rows = tuple((labels[r], fleet.verdict[r], _why(fleet, r)) for r in order[:SHOWN])
+    rows = tuple((labels[r], fleet.verdict[r], _why(fleet, r)) for r in order[:most])
     columns = (Column("sensor"), Column("verdict"), Column("why"))
-    return Table("Not good", columns, rows, _more(len(bad)))
+    return Table("Not good", columns, rows, _more(len(bad), most))

@@ -83,14 +83,37 @@ def record(plan: Plan) -> dict[str, object]:
     )
 
 
-def blocks(plan: Plan) -> list[Block]:
-    """Return what a plan shows: doubts about the poses so far, the poses to take, and what to expect of them."""
+def shown_poses(plan: Plan) -> Table:
+    """Return one row per pose for people: how to hold the sensor, and the worst of each kind expected after it."""
+    rows = []
+    for k, stage in enumerate(plan.stages):
+        worst = [_finite(float(stage.dop[kind].max())) for _, kind, _, _ in KINDS]
+        sigma = [_times(dop, plan.noise, size) for dop, (*_, size) in zip(worst, KINDS, strict=True)]
+        hold = describe(plan.directions[k - 1]) if k else "so far"
+        rows.append((plan.poses + k, hold, *(worst if plan.noise is None else sigma)))
+    what = "dilution of precision" if plan.noise is None else "sigma"
+    columns = (
+        Column("pose", format="d"),
+        Column("hold"),
+        *(Column(SHORT[kind], "" if plan.noise is None else unit, ".3g") for kind, _, unit, _ in KINDS),
+    )
+    note = f"Largest {what} of each kind after the pose; a dash where the poses do not determine it."
+    return Table(
+        f"Poses to take next, and the {what} after each", columns, tuple(rows), (note, *_notes(plan))
+    ).filled()
+
+
+def blocks(plan: Plan, verbose: bool = False) -> list[Block]:
+    """Return what a plan shows: doubts about the poses so far, the poses to take, and what to expect of them.
+
+    With `verbose` the directions as vectors, and what to expect of each parameter.
+    """
     known, expected = plan.so_far, parameter_table(plan)
     doubts: list[Block] = []
     if known is not None and (known.warnings or plan.beyond_poses):
         doubts = [Conclusion(known.verdict, known.reasons, known.warnings, "Verdict so far"), BLANK]
     more = [expected] if len(expected.columns) > 1 else []  # poses that determine nothing promise nothing
-    return [*doubts, pose_table(plan), *more]
+    return [*doubts, *([pose_table(plan)] if verbose else [shown_poses(plan)]), *(more if verbose else [])]
 
 
 def _notes(plan: Plan) -> tuple[str, ...]:

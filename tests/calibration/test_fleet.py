@@ -345,7 +345,7 @@ def test_sensors_that_stand_out_are_named_and_no_others(odd):
     assert {(labels[one.at], one.name) for one in found} == {
         ("S07", "scale factor y"),
         ("S20", "bias z"),
-        ("S33", "noise of a pose, s"),
+        ("S33", "noise of one pose, s"),
     }
     by = {labels[one.at]: one for one in found}
     assert by["S07"].z > 5

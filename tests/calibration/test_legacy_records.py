@@ -35,7 +35,7 @@ def test_a_file_of_schema_1_loads(kind):
     assert "verdict is by the old rule" in result.warnings[-1].text
     again = Calibration.from_record(json.loads(json.dumps(result.record())), "r")
     assert again.record() == result.record()
-    assert again.schema == SCHEMA == "accelcal/calibration/2"
+    assert again.schema == SCHEMA == "accelcal/calibration/3"
 
 
 @pytest.mark.parametrize("kind", ["plain", "temperature"])

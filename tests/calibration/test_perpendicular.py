@@ -17,7 +17,7 @@ from accelcal_cli.errors import ConfigError
 from accelcal_cli.exporters.base import EXPORTERS
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
-from accelcal_cli.planning import plan
+from accelcal_cli.planning import plan_from
 from accelcal_cli.sensor import poses
 from accelcal_cli.sensor.model import ErrorModel
 from accelcal_cli.verification.verify import verify
@@ -117,7 +117,7 @@ def test_more_faces_are_suggested_and_planned():
     assert all(len(suggestion.split()) == 2 for suggestion in first.suggestions)
     assert len(set(first.suggestions)) == len(first.suggestions)
     result = calibrate(read(np.repeat(poses.faces(), 2, axis=0), sigma=1e-2), SIX)
-    found = plan(result.information, result.poses, 6, "faces", 1e-3, result)
+    found = plan_from(result.information, result.poses, 6, "faces", 1e-3, result)
     assert found.verdict == "good"
     last = pose_table(found).records()[-1]
     assert last["dop_scale"] == pytest.approx(np.sqrt(1 / 6), rel=0.02)

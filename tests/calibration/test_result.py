@@ -130,10 +130,10 @@ def test_a_record_carries_its_units_and_origin():
     assert _result("labelled, robust, in g").poses_fit[3].where == 'position "pose 3"'
 
 
-@pytest.mark.parametrize("schema", [None, "accelcal/calibration/3", "other", 1])
+@pytest.mark.parametrize("schema", [None, "accelcal/calibration/4", "other", 1])
 def test_another_schema_is_refused(schema):
     record = {**_result("good").record(), "schema": schema}
-    with pytest.raises(DataError, match=r"old.yaml: schema is .*expected \"accelcal/calibration/2\""):
+    with pytest.raises(DataError, match=r"old.yaml: schema is .*expected \"accelcal/calibration/3\""):
         Calibration.from_record(record, "old.yaml")
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from raw_logs import opened, simulated, text
 
 from accelcal_cli.detection.detect import DetectSettings, TooFewPosesError, detect
 from accelcal_cli.detection.log_screening import alternating
 from accelcal_cli.errors import DataError
-from tests.raw_logs import opened, simulated, text
 
 SETTINGS = DetectSettings(rate=100.0, least_poses=10)
 

@@ -4,12 +4,12 @@ import io
 
 import numpy as np
 import pytest
+from simulated import DPSO, MEMS, readings
 
 from accelcal_cli.io.readings import Readings, read_readings
 from accelcal_cli.io.screening import Screened, needs_look
 from accelcal_cli.io.ties import grid_step
 from accelcal_cli.sensor.poses import directions
-from tests.simulated import DPSO, MEMS, readings
 
 G = 9.80665
 UNITS = {"m/s^2": 1.0, "g": 1 / G, "counts": 8192 / G}

@@ -208,7 +208,7 @@ def test_a_plot_without_matplotlib(run, monkeypatch):
     )
     done = run(*QUICK, "--plot", "a.png")
     assert done.code == 2
-    assert done.err == "accelcal: --plot needs matplotlib: pip install 'accelcal[plot]'\n"
+    assert done.err == "accelcal: --plot needs matplotlib: python -m pip install matplotlib\n"
 
 
 def test_progress_is_for_terminals_only(run):

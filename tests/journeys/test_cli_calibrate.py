@@ -72,7 +72,7 @@ def truth(run, *arguments):
 
 def test_json_keeps_its_contract(run, good):
     result = record(run, good)
-    assert result["schema"] == SCHEMA == "accelcal/calibration/2"
+    assert result["schema"] == SCHEMA == "accelcal/calibration/3"
     assert set(CONTRACT) <= set(result)
     for name, expected in CONTRACT.items():
         if isinstance(expected, tuple) and isinstance(expected[0], int):
@@ -148,9 +148,19 @@ def test_csv_has_a_row_a_parameter(run, good):
 
 
 def test_the_table_says_it_all(run, good):
-    outcome = run("calibrate", good)
-    for part in ("Verdict: good", "Calibration", "Engineering view", "Fit", "Observability", "Worst poses"):
+    outcome, whole = run("calibrate", good), run("calibrate", good, "--verbose")
+    for part in ("Verdict: good", "Calibration", "Engineering view", "Fit"):
         assert part in outcome.out
+    for part in (
+        "Verdict: good",
+        "Calibration",
+        "Engineering view",
+        "Fit",
+        "Observability",
+        "Poses",
+        "Convergence",
+    ):
+        assert part in whole.out
     assert "gauge lower" in outcome.out
     assert "g = 9.80665 assumed" in outcome.err
 

@@ -143,7 +143,7 @@ def test_the_poses_so_far_may_come_from_a_raw_log(run, tmp_path):
 
 
 def test_the_table_says_how_to_hold_the_sensor(run):
-    done = run("plan", "--poses", "12", "--fixture", "edges", "--noise", "0.01")
+    done = run("plan", "--poses", "12", "--fixture", "edges", "--noise", "0.01", "--verbose")
     assert done.code == 0
     assert "+x up, tilted 45 degrees towards" in done.out
     assert "Expected after all 12 poses" in done.out

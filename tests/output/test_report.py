@@ -125,7 +125,7 @@ def test_a_page_holds_every_part(good):
         "Sensor 7",
         good.data["sha256"],
         f"accelcal {accelcal_cli.__version__}",
-        "accelcal/calibration/2",
+        "accelcal/calibration/3",
         f"{good.K_a[0, 0]:.8g}",
         f"{good.interval.D_a[2]:.2g}",
         "scale factor error x",

@@ -13,7 +13,7 @@ from accelcal_cli.calibration.settings import load_settings
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.optimization.algorithms.de import DifferentialEvolution
 from accelcal_cli.optimization.minimize import Stopping, minimize
-from accelcal_cli.optimization.optimizer import Status
+from accelcal_cli.optimization.optimizer import OPTIMIZERS, Status
 from accelcal_cli.optimization.problem import FunctionProblem
 from accelcal_cli.studies import peers
 from accelcal_cli.studies.functions import TestFunction
@@ -160,6 +160,7 @@ def test_a_class_on_the_command_line_is_an_optimizer(own):
     assert (optimizer.population, optimizer.reach, type(optimizer).__name__) == (20, 0.1, "Shrinking")
     run = minimize(TestFunction("sphere", 3), optimizer)
     assert run.cost[0] < run.trace[0, 0]
+    assert f"{own}:Shrinking" not in OPTIMIZERS.names()  # no file and no list may call it
 
 
 def test_a_function_on_the_command_line_is_a_search(own):

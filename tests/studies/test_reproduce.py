@@ -44,7 +44,7 @@ def rows_of(experiment):
 
 def test_every_experiment_of_the_papers_is_there():
     assert reproduce.names() == NAMES
-    assert reproduce.navigation_names() == ["depf-rmse", "depf-strategies"]
+    assert reproduce.navigation_names() == ["depf-readings", "depf-rmse", "depf-strategies"]
     assert [row[0] for row in reproduce.catalogue()] == sorted([*NAMES, *reproduce.navigation_names()])
 
 
