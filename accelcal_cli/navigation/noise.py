@@ -42,7 +42,7 @@ class NoiseModel:
         bias: sigma of a constant bias, mGal.
         map_error: sigma of the correlated error of the map, mGal; distance: its correlation length, m.
         gate: innovations beyond so many sigma are left out; 0: none.
-        eotvos: whether the Eoetvoes effect was computed from the velocity of the INS, and errs by its error.
+        eotvos: whether the Eoetvoes effect was computed from the velocity of the INS, and holds its error.
     """
 
     bias: float = 0.0
