@@ -208,10 +208,14 @@ def program(
     """Calibrate three-axis accelerometers without a turntable."""
 
 
+COMPLETION = "_ACCELCAL_COMPLETE"
+"""Set by a shell that asks how a command line may go on."""
+
+
 def main() -> None:
     """Run the command line; exit 0 done, 1 done with a bad verdict, 2 bad input, 128 + n by signal n."""
     _open_streams()
-    if sys.argv[1:] in ([], ["help"]):
+    if sys.argv[1:] in ([], ["help"]) and COMPLETION not in os.environ:
         _guide()
     if sys.argv[1:2] == ["help"]:
         sys.argv[1:] = [*sys.argv[2:], "--help"]

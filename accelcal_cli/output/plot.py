@@ -194,7 +194,8 @@ def _abscissa(detection: Detection) -> tuple[str, Callable[[Float], Float]]:
     if time is None:
         return "row", lambda rows: rows
     unit = UNITS[detection.time_unit]
-    first, last = float(time[0, 0]) * unit, float(time[-1, 1]) * unit
+    at = time.ravel() if len(time) or detection.envelope is None else detection.envelope.bins()[0]
+    first, last = (float(at[0]) * unit, float(at[-1]) * unit) if len(at) else (0.0, 0.0)
     began = detection.began
     if began is None and EPOCH[0] < first < EPOCH[1]:
         began = np.datetime64(0, "s")

@@ -395,7 +395,9 @@ def test_a_broken_sensor_has_the_warnings_of_calibrate(clipped, tmp_path):
     assert "Outlier: line 295 does not fit the other poses" in fleet.warnings[12][0].text
     assert counts(fleet) == "30 sensors: 28 good, 2 suspect, 2 of them with a note or a warning"
     (table,) = [
-        t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table) and t.title == "Warnings"
+        t
+        for t in blocks(fleet, readings.sensors, [], G, verbose=True)
+        if isinstance(t, Table) and t.title == "Warnings"
     ]
     assert [row[0] for row in table.rows] == ["S07", "S12"]
     assert table.rows[0][1] == pytest.approx(100 * fleet.s[7] / G)
@@ -495,8 +497,12 @@ def test_the_summary_tells_what_is_wrong(mixed):
     path, _ = mixed
     readings = read_fleet([path])
     fleet = calibrate_fleet(readings, LM)
-    tables = {t.title: t for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table)}
-    assert list(tables) == ["Fleet", "Worst fit", "Warnings", "Not good"]
+    brief = [t.title for t in blocks(fleet, readings.sensors, [], G) if isinstance(t, Table)]
+    assert brief == ["Not good", "Fleet"]
+    tables = {
+        t.title: t for t in blocks(fleet, readings.sensors, [], G, verbose=True) if isinstance(t, Table)
+    }
+    assert list(tables) == ["Not good", "Fleet", "Worst fit", "Warnings"]
     first = tables["Not good"].rows[0]
     assert first[1] == FAILED
     assert "only one pose" in first[2] or "equal" in first[2]

@@ -148,9 +148,12 @@ def test_reproduce_prints_its_tables(run):
     assert "e PSO c=1.496" in shown
     record = json.loads(run(*SMALL, "--format", "json").out)
     assert record["name"] == "dpso-figure2"
-    assert [len(table["rows"]) for table in record["tables"]] == [5, 5]
+    # Costs, their spread, and costs on the way of four optimizers by both readings; evaluations to the tolerance.
+    assert [len(table["rows"]) for table in record["tables"]] == [8, 8, 8, 28]
     blocks = run(*SMALL, "--format", "csv").out.split("\n\n")
-    assert [block.split("\n")[0].split(",")[0] for block in blocks] == ["optimizer", "optimizer"]
+    assert len(blocks) == len(record["tables"])
+    firsts = [block.split("\n")[0].split(",")[0] for block in blocks]
+    assert firsts == [*["optimizer"] * 3, "varies"]
 
 
 def test_reproduce_writes_raw_results_and_plots(run, tmp_path):

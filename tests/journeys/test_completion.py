@@ -34,7 +34,10 @@ def complete(shell):
         ("accelcal benchmark --optimizer de-pso,sh", ["de-pso,shade-cma"]),
         ("accelcal compare --gauge ", ["lower", "full"]),
         ("accelcal reproduce dpso-figure", ["dpso-figure2"]),
-        ("accelcal navigate --filter ", ["apo-pf", "de-pf", "pf", "pso-pf", "reference", "all"]),
+        (
+            "accelcal navigate --filter ",
+            ["apo-pf", "de-pf", "mpf", "pf", "point-mass", "pso-pf", "reference", "sitan", "all"],
+        ),
         ("accelcal navigate --map ", ["rough", "moderate", "constant"]),
         ("accelcal simulate --sensor ", ["dpso", "mems", "navigation"]),
         ("accelcal plan --fixture ", ["faces", "edges", "corners", "any"]),

@@ -214,7 +214,9 @@ def test_a_broken_sensor_is_told_in_every_form(run):
     shown = run("fleet", "cut.csv", "-q")
     assert (shown.code, shown.err) == (1, "accelcal: 1 of 20 sensors suspect: S07\n")
     assert shown.out.startswith("20 sensors: 19 good, 1 suspect, 1 of them with a note or a warning\n")
-    assert "\nWarnings\n" in shown.out
+    assert "\nNot good\n" in shown.out
+    assert "\nWarnings\n" not in shown.out
+    assert "\nWarnings\n" in run("fleet", "cut.csv", "-q", "--verbose").out
     by_csv = rows_of(run("fleet", "cut.csv", "-q", "--format", "csv").out)
     by_json = json.loads(run("fleet", "cut.csv", "-q", "--format", "json", "-o", "results/").out)
     said = {row["sensor"]: " ".join(str(Notice(**one)) for one in row["warnings"]) for row in by_json}

@@ -301,7 +301,7 @@ def test_known_attitudes_on_the_command_line(run):
     )
     assert record["gauge"] == "full"
     assert None not in np.ravel(record["sigma"]["K_a"])
-    shown = run("calibrate", "known.csv", "--g", G, "--attitudes", "known").out
+    shown = run("calibrate", "known.csv", "--g", G, "--attitudes", "known", "--verbose").out
     assert "linear least squares" in shown
     assert "a rotation of the body frame is free" not in shown
 

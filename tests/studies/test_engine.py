@@ -116,7 +116,7 @@ class Poison(Benchmark):
 
 def test_a_task_that_kills_every_worker_ends_the_study(monkeypatch, tmp_path):
     monkeypatch.setattr(engine, "POOLS", 2)
-    poison = Poison(STUDY.functions, STUDY.entries, 3, 2)
+    poison = Poison(STUDY.functions, STUDY.entries, STUDY.dimensions, 2)
     journal = Journal.open(tmp_path / "j", poison, False)
     with pytest.raises(DataError, match="workers died 2 times in a row"):
         run_study(poison, journal, partial(pools.local_pool, 1))
