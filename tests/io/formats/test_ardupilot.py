@@ -15,7 +15,7 @@ from accelcal_cli.io.reader import ReadOptions, Selection, open_table
 from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.sensor.triad import rotation
 
-SHARED = next((p for p in (Path(__file__).parents[4] / "shared", Path("/work/shared")) if p.is_dir()), None)
+SHARED = Path(__file__).parents[4] / "shared"
 TIMES = np.arange(400) / 50
 FORCE = np.random.default_rng(4).normal(size=(400, 3)).astype(np.float32).astype(float)
 BOTH = {0: (TIMES, FORCE), 1: (TIMES, FORCE + 1)}
@@ -29,8 +29,8 @@ PARAMETERS = {
 
 
 def sample() -> Path:
-    path = None if SHARED is None else SHARED / "data/native/ardupilot_sample.BIN"
-    if path is None or not path.is_file():
+    path = SHARED / "data/native/ardupilot_sample.BIN"
+    if not path.is_file():
         pytest.skip("shared data are not there")
     return path
 

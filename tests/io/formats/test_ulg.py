@@ -16,7 +16,7 @@ from accelcal_cli.io.reader import ReadOptions, Selection, open_table
 from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.sensor.triad import rotation
 
-SHARED = next((p for p in (Path(__file__).parents[4] / "shared", Path("/work/shared")) if p.is_dir()), None)
+SHARED = Path(__file__).parents[4] / "shared"
 TIMES = np.arange(500) / 100
 FORCE = np.random.default_rng(4).normal(size=(500, 3)).astype(np.float32).astype(float)
 SLOW = np.arange(5.0)
@@ -47,8 +47,8 @@ def opened(path: object, accelerometer: str | None = None) -> NativeTable:
 
 
 def sample() -> Path:
-    path = None if SHARED is None else SHARED / "data/native/px4_sample.ulg"
-    if path is None or not path.is_file():
+    path = SHARED / "data/native/px4_sample.ulg"
+    if not path.is_file():
         pytest.skip("shared data are not there")
     return path
 
