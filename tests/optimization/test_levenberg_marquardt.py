@@ -179,3 +179,13 @@ def test_a_run_without_a_slope_fails_alone():
     assert run.cost[1] == 20.0
     alone = _ours(problem, starts[[2]])
     np.testing.assert_array_equal(run.x[2], alone.x[0])
+
+
+def test_a_start_without_a_slope_does_not_end_the_others_of_its_run():
+    starts = np.array([[[2.0, 1.0, -0.5], [2.0, 1.0, 0.8]]])
+    problem = Flat()
+    problem.lower, problem.y = np.array([0.5, 0.2, -1.0]), problem.y + 0.8
+    run = minimize(problem, LevenbergMarquardt(population=2), runs=1, start=starts)
+    alone = _ours(problem, starts[:, 1])
+    assert run.status == alone.status == (Status.CONVERGED,)
+    np.testing.assert_allclose(run.x, alone.x, atol=1e-6)
