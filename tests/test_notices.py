@@ -184,8 +184,12 @@ def _made():
                     yield tuple(stated)
 
 
-ELSEWHERE = {("correlated", "warning"), ("suspect-result", "note")}
-"""Made by groups of rows that are fewer than few attitudes, and by verify, whose own test has it."""
+ELSEWHERE = {
+    *(("correlated", "warning"), ("suspect-result", "note")),
+    *(("nis", "warning"), ("fix", "warning"), ("disturbed", "note"), ("gap", "note")),
+}
+"""Made by groups of rows that are fewer than few attitudes, and by verify, whose own test has it; and of recorded
+voyages, which are no calibrations: tests/navigation has them."""
 
 
 def test_a_notice_is_its_sentence_and_what_to_do():

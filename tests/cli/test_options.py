@@ -13,8 +13,8 @@ from accelcal_cli.calibration import settings
 from accelcal_cli.cli import benchmark, calibrate, compare, navigate, options, running
 from accelcal_cli.cli.main import NAMES, app, expand, help_text
 from accelcal_cli.exporters.base import EXPORTERS
+from accelcal_cli.navigation.filter import FILTERS
 from accelcal_cli.navigation.gravity_map import PRESETS
-from accelcal_cli.navigation.particle_filter import FILTERS
 from accelcal_cli.optimization import optimizer
 from accelcal_cli.optimization.optimizer import OPTIMIZERS
 from accelcal_cli.planning import FIXTURES
