@@ -90,6 +90,31 @@ class CandidateThreshold:
     verdict: str = "undetermined"
 
 
+def screened_poses(
+    intervals: Intervals, source: str, columns: tuple[str, str, str], behind: Behind | None, *, warm: bool
+) -> tuple[Notice, ...]:
+    """Return what the poses of a log show that are no readings of a sensor at rest.
+
+    Args:
+        intervals: the poses; source, columns: of the log; behind: the rows behind them; warm: whether they have
+            temperatures.
+    """
+    first = slice(LOOKED_AT)
+    screened = Screened(
+        intervals.mean[first],
+        columns,
+        len(intervals),
+        intervals.where,
+        source,
+        single=False,
+        warm=warm,
+        count=intervals.n[first].astype(float),
+        scatter=intervals.scatter[first],
+        behind=behind,
+    )
+    return screened.notices()
+
+
 @dataclass(frozen=True)
 class Detection:
     """Static poses of a raw log and how they were found.
@@ -130,20 +155,9 @@ class Detection:
         intervals, notes = self.intervals, (*self.notes, self.summary())
         readings = readings_of(intervals, self.source)
         said = {notice.key for notice in self.warnings}
-        first = slice(LOOKED_AT)
-        screened = Screened(
-            intervals.mean[first],
-            self.columns,
-            len(intervals),
-            intervals.where,
-            self.source,
-            single=False,
-            warm=readings.temperature is not None,
-            count=intervals.n[first].astype(float),
-            scatter=intervals.scatter[first],
-            behind=self.behind,
-        )
-        more = [notice for notice in screened.notices() if notice.key not in said]
+        warm = readings.temperature is not None
+        found = screened_poses(intervals, self.source, self.columns, self.behind, warm=warm)
+        more = [notice for notice in found if notice.key not in said]
         return readings.known_as(
             self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more), self.form
         )

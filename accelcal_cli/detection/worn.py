@@ -26,13 +26,13 @@ from accelcal_cli.calibration.observability import (
 )
 from accelcal_cli.calibration.result import Calibration, Worn
 from accelcal_cli.calibration.temperature import FEWEST_FOR_SLOPES, SMALLEST_RANGE
-from accelcal_cli.detection.detect import readings_of, screen
+from accelcal_cli.detection.detect import readings_of, screen, screened_poses
 from accelcal_cli.detection.intervals import ROUNDING, Intervals
 from accelcal_cli.detection.rawlog import RawLog
 from accelcal_cli.detection.windows import Span, Tiles
 from accelcal_cli.errors import DataError
 from accelcal_cli.io.readings import InputForm, Readings
-from accelcal_cli.io.screening import LOOKED_AT, Behind, Screened
+from accelcal_cli.io.screening import Behind
 from accelcal_cli.notices import Notice
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
 
@@ -135,23 +135,13 @@ class Wear:
 
     def readings(self) -> Readings:
         """Return the poses as readings that follow in time and carry the origin of the log."""
-        intervals, first = self.intervals, slice(LOOKED_AT)
+        intervals = self.intervals
         readings = replace(readings_of(intervals, self.source), in_time=True)
         said = [notice.key for notice in self.warnings]
-        screened = Screened(
-            intervals.mean[first],
-            self.columns,
-            len(intervals),
-            intervals.where,
-            self.source,
-            single=False,
-            warm=readings.temperature is not None,
-            count=intervals.n[first].astype(float),
-            scatter=intervals.scatter[first],
-            behind=self.behind,
-        )
+        warm = readings.temperature is not None
+        found = screened_poses(intervals, self.source, self.columns, self.behind, warm=warm)
         # That a watch on a table is quieter than one on a wrist needs no words.
-        more = [notice for notice in screened.notices() if notice.key not in (*said, "unequal-noise")]
+        more = [notice for notice in found if notice.key not in (*said, "unequal-noise")]
         notes = (*self.notes, self.summary())
         return readings.known_as(
             self.sha256, self.columns, notes, intervals.where, (*self.warnings, *more), self.form
