@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain, islice, pairwise
@@ -45,6 +46,36 @@ _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"']+")
 def file_lines(file: BinaryIO) -> Iterator[bytes]:
     """Return the lines of an open file as they arrive."""
     return iter(lambda: file.readline(LONGEST), b"")
+
+
+def recorded_lines(path: str) -> Iterator[bytes]:
+    """Return the lines of a file, the recording of a capture or of any program that prints readings.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            yield from file_lines(file)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+
+
+def in_time(readings: Iterable[Float], rate: float) -> Iterator[Float]:
+    """Yield readings as a sensor would send them, `rate` a second; none is left out where the reader is slow."""
+    start = time.monotonic()
+    for number, reading in enumerate(readings):
+        wait = start + number / rate - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        yield reading
+
+
+def copied(lines: Iterable[bytes], file: BinaryIO) -> Iterator[bytes]:
+    """Yield lines and write each to a file, from which they replay."""
+    for line in lines:
+        file.write(line.rstrip(b"\r\n") + b"\n")
+        yield line
 
 
 def port_lines(name: str, baud: int, timeout: float) -> Iterator[bytes]:
