@@ -205,6 +205,11 @@ def _open_page(capture: Capture, bind: str, port: int) -> LivePage:
 
     page = LivePage(capture, bind, port)
     typer.echo(f"accelcal: open {page.server.address}", err=True)
+    if page.is_shared and sys.stderr.isatty() and sys.stderr.encoding.lower().startswith("utf"):
+        try:
+            typer.echo(page.qr_code(), err=True)
+        except UsageError as missing:
+            options.tell([str(missing)])
     return page
 
 

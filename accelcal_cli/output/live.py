@@ -35,6 +35,9 @@ LISTED = 100
 HEIGHT = 36
 """Lines of a narrower terminal that has it below."""
 
+SENTENCES = 2
+"""Sentences on the poses that are shown, a line each; the command says all of them at its end."""
+
 NARROWEST = 3 + MAP_WIDTH + 2 + BOX_WIDTH
 """Columns that map and box need side by side."""
 
@@ -171,16 +174,16 @@ def _list(now: Moment | None, so_far: Progress) -> list[Text]:
 
 def _calibration(so_far: Progress) -> list[Text]:
     """Return the calibration of the poses so far, or what it waits for."""
-    found = so_far.summary
+    found, said = so_far.summary, [Text(sentence) for sentence in so_far.sentences[:SENTENCES]]
     if found is None:
-        return [Text(f"calibration: {so_far.outlook}")]
+        return [Text(f"calibration: {so_far.outlook}"), *said]
     bias = "  ".join(f"{axis} {value}" for axis, (value, _) in zip(AXES, found.bias, strict=True))
     dop = "  ".join(f"{kind} {size}" for kind, size in found.dop)
     return [
         Text.assemble("calibration: ", (found.verdict, VERDICT_STYLE.get(found.verdict, "bold"))),
         Text(f"bias  {bias}   s {found.noise}"),
         Text(f"DOP   {dop}"),
-        *(Text(sentence) for sentence in found.sentences[:2]),
+        *said,
     ]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import ipaddress
 import threading
 import time
 from collections.abc import Mapping
@@ -95,6 +97,25 @@ class LivePage:
         while self.server.opened and not self._closing.wait(PATIENCE):
             if not self.server.pages and time.monotonic() - self.server.left > LINGER:
                 return
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether other machines reach the page."""
+        return not ipaddress.ip_address(self.server.bind).is_loopback
+
+    def qr_code(self) -> str:
+        """Return the address as a QR code of blocks for a terminal, for the camera of a telephone.
+
+        Raises:
+            UsageError: segno is missing.
+        """
+        try:
+            import segno
+        except ImportError:
+            raise UsageError("a QR code of the address needs segno: python -m pip install segno") from None
+        text = io.StringIO()
+        segno.make(self.server.address, micro=False).terminal(text, compact=True)
+        return text.getvalue()
 
     def close(self) -> None:
         """Serve no more."""

@@ -27,6 +27,9 @@ STATES: dict[State, str] = {
 FEWEST = 9
 """Poses below which nothing is determined: the parameters to estimate."""
 
+DONE = "all poses are taken"
+"""What to say of a sensor that is still in place of going on to another pose."""
+
 UNKNOWN = "-"
 """What stands for a number that is not there."""
 
@@ -62,13 +65,12 @@ class Summary:
     """The calibration of the poses so far, in the words and digits that people read.
 
     Attributes:
-        verdict: its word; sentences: what the poses leave open, and what speaks against the result.
+        verdict: its word.
         bias: of each axis, value and half-width of its 95 % interval (empty without one), output units.
         noise: standard deviation of one pose, with its unit; dop: dilution of precision by kind.
     """
 
     verdict: str
-    sentences: tuple[str, ...]
     bias: tuple[tuple[str, str], ...]
     noise: str
     dop: tuple[tuple[str, str], ...]
@@ -82,6 +84,7 @@ class Progress:
         planned: directions; words: how to hold each; numbers: of the captured pose that each is, None for missing.
         taken: directions of the captured poses; others: how many of them are not in the plan.
         summary: of their calibration, None while there is none.
+        sentences: what the poses leave open, and what speaks against them.
     """
 
     planned: tuple[Direction, ...]
@@ -90,6 +93,7 @@ class Progress:
     taken: tuple[Direction, ...]
     others: int
     summary: Summary | None
+    sentences: tuple[str, ...]
 
     @property
     def missing(self) -> int:
@@ -120,13 +124,13 @@ def moment(capture: Capture, status: CaptureStatus) -> Moment:
         _numbers(status.reading),
         capture.length(status.reading),
         status.state,
-        STATES[status.state],
+        DONE if status.state in ("taken", "again") and not missing else STATES[status.state],
         status.progress,
         status.spread,
         status.limit,
         _numbers(status.direction),
         held,
-        f"{status.angle:.0f} degrees from {near}",
+        f"{status.angle:.0f} degree{'s' * (round(status.angle) != 1)} from {near}",
         further[0] if further else None,
     )
 
@@ -136,6 +140,8 @@ def progress(capture: Capture) -> Progress:
     recognised = capture.recognised()
     at = {index: number for number, index in enumerate(recognised, 1) if index is not None}
     enough = capture.calibration if len(capture.poses) >= FEWEST else None
+    notices = capture.notices() if enough is None else enough.warnings
+    reasons = () if enough is None else enough.reasons
     return Progress(
         tuple(map(_numbers, capture.planned)),
         tuple(map(describe, capture.planned)),
@@ -143,6 +149,7 @@ def progress(capture: Capture) -> Progress:
         tuple(map(_numbers, capture.directions())),
         recognised.count(None),
         None if enough is None else summary(enough),
+        (*reasons, *(f"{notice.severity.capitalize()}: {notice}" for notice in notices)),
     )
 
 
@@ -157,7 +164,6 @@ def summary(result: Calibration) -> Summary:
     dop = {"scale": result.dop.scale, "misalignment": result.dop.misalignment, "bias": result.dop.bias}
     return Summary(
         result.verdict,
-        (*result.reasons, *(f"{n.severity.capitalize()}: {n}" for n in result.warnings)),
         tuple(bias),
         f"{result.s:.3g} {result.unit}" if result.freedom > 0 else UNKNOWN,
         tuple((kind, f"{size:.3g}" if math.isfinite(size) else "infinite") for kind, size in dop.items()),

@@ -13,6 +13,9 @@ function tell(id, text) {
   if (target.textContent !== text) target.textContent = text;
 }
 
+/** How a pose is held, with minus signs at which no line breaks. */
+const hold = (words) => words.replaceAll("-", "\u2212");
+
 function classed(id, name) {
   if (element(id).className !== name) element(id).className = name;
 }
@@ -58,7 +61,7 @@ function showMoment(now) {
   tell("state", now.words);
   classed("state", now.state);
   element("hold").value = now.state === "taken" ? 1 : now.progress;
-  tell("held", `held: ${now.hold}`);
+  tell("held", `held: ${hold(now.hold)}`);
   const size = Math.hypot(...now.reading) || 1;
   const whole = 1.2 * Math.max(size / (now.length || 1), Math.max(...now.reading.map(Math.abs)) / 1.2);
   ["x", "y", "z"].forEach((axis, k) => {
@@ -80,7 +83,7 @@ function showMoment(now) {
 function showNext() {
   const { progress } = seen;
   const { next } = globe.scene;
-  tell("next-words", progress && next !== null ? progress.words[next] : seen.progress ? "all poses are taken" : "-");
+  tell("next-words", progress && next !== null ? hold(progress.words[next]) : seen.progress ? "all poses are taken" : "-");
   if (progress && next !== null) globe.face(progress.planned[next]);
 }
 
@@ -103,7 +106,7 @@ function showProgress(found) {
   tell("count", found.count);
   const rows = found.words.map((words, index) => {
     const number = found.numbers[index];
-    return number === null ? made("li", words) : made("li", `${words}: pose ${number}`, "taken");
+    return number === null ? made("li", hold(words)) : made("li", `${hold(words)}: pose ${number}`, "taken");
   });
   element("list").replaceChildren(...rows);
   showNext();
@@ -116,9 +119,9 @@ function showSummary(found) {
   const summary = found.summary;
   tell("verdict", found.outlook);
   classed("verdict", summary ? summary.verdict : "");
+  element("sentences").replaceChildren(...found.sentences.map((text) => made("li", text)));
   element("numbers").hidden = !summary;
   if (!summary) return;
-  element("sentences").replaceChildren(...summary.sentences.map((text) => made("li", text)));
   element("bias").replaceChildren(
     ...summary.bias.map(([value, spread], k) => {
       const row = made("tr");
@@ -184,6 +187,7 @@ function draw() {
     globe.draw();
     const tones = colours();
     const { next } = globe.scene;
+    element("box-next").parentElement.hidden = next === null;
     drawBox(element("box-next"), seen.progress && next !== null ? seen.progress.planned[next] : null, tones.accent);
     drawBox(element("box-now"), seen.moment && seen.moment.direction, tones.quiet);
   });
@@ -248,6 +252,11 @@ element("stop").addEventListener("click", async () => {
     return;
   }
   await act("/stop");
+});
+
+element("stop").addEventListener("blur", () => {
+  element("stop").classList.remove("sure");
+  element("stop").textContent = "End the capture";
 });
 
 element("form").addEventListener("submit", async (event) => {

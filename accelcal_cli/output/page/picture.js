@@ -68,7 +68,8 @@ function drawBox(canvas, direction, colour) {
   const place = prepared(canvas);
   if (!place || !direction) return;
   const { pen, width, height } = place;
-  const size = 0.27 * Math.min(width, height);
+  const size = 0.25 * Math.min(width, height);
+  const middle = width / 2 - 8; // an arrow is beside it
   const world = attitude(direction);
   const seen = (body) => {
     const turned = world.map((row) => dot(row, body));
@@ -76,7 +77,7 @@ function drawBox(canvas, direction, colour) {
   };
   const at = (body) => {
     const [right, up] = seen(body);
-    return [width / 2 + size * right, height / 2 - size * up];
+    return [middle + size * right, height / 2 - size * up];
   };
   const tones = colours();
   for (let axis = 0; axis < 3; axis += 1) {
@@ -102,7 +103,7 @@ function drawBox(canvas, direction, colour) {
       pen.fillText(`${sign > 0 ? "+" : "\u2212"}${AXES[axis]}`, ...at(normal));
     }
   }
-  const [column, top] = [width - 12, height / 2]; // up is up
+  const [column, top] = [width - 8, height / 2]; // up is up
   pen.strokeStyle = tones.quiet;
   pen.beginPath();
   pen.moveTo(column, top + 18);
