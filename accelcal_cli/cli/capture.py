@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
@@ -151,7 +151,7 @@ def command(
         else:
             lines = serial.port_lines(port, baud, timeout)
         if record is not None:
-            lines = serial.copied(lines, stack.enter_context(_opened_record(record)))
+            lines = serial.copied(lines, record)
         source = "<stdin>" if port == "-" else port
         readings = serial.readings(lines, chosen, source, line, lambda note: options.tell([note], quiet))
         _run(
@@ -188,15 +188,6 @@ def _check_outputs(port: str, outputs: dict[str, str | None], overwrite: bool) -
         if [Path(other).resolve() for other in named.values()].count(Path(path).resolve()) > 1:
             raise UsageError(f'{option} "{path}": is stated twice; expected a name of its own')
         check_target(path)
-
-
-def _opened_record(path: str) -> BinaryIO:
-    from accelcal_cli.output.files import unwritten
-
-    try:
-        return open(path, "wb")
-    except OSError as error:
-        raise unwritten(path, error) from None
 
 
 def _open_page(capture: Capture, bind: str, port: int) -> LivePage:
@@ -295,6 +286,8 @@ def _run(
             made.save(result)
         where = "" if result is None else f", in {result}"
         summary += f"; their calibration is {made.verdict}{where}"
+    elif result is not None and capture.poses:
+        summary += f"; they allow no calibration, {result} is not written"
     if page is not None:
         page.finish(summary if ending is None else f"{ending}; {summary}", made)
     if ending is not None:
@@ -354,8 +347,8 @@ def _calibrated(capture: Capture, file: PoseFile, g: float | None) -> Calibratio
 
     if not capture.poses:
         return None
-    readings = capture.readings()
     try:
+        readings = capture.readings()
         if Path(file.path).is_file() and file.kept:
             filed = read_readings(file.path)
             readings = replace(filed, warnings=readings.warnings, form=replace(filed.form, unit=capture.unit))

@@ -6,14 +6,14 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.errors import DataError, OutputError, UsageError
 from accelcal_cli.io.lines import LineFilter, find_filter
 from accelcal_cli.io.vocabulary import recognise
 
@@ -71,11 +71,27 @@ def in_time(readings: Iterable[Float], rate: float) -> Iterator[Float]:
         yield reading
 
 
-def copied(lines: Iterable[bytes], file: BinaryIO) -> Iterator[bytes]:
-    """Yield lines and write each to a file, from which they replay."""
-    for line in lines:
-        file.write(line.rstrip(b"\r\n") + b"\n")
-        yield line
+def copied(lines: Iterable[bytes], path: str) -> Iterator[bytes]:
+    """Yield lines and write each to a file, from which they replay; it holds those so far, whatever ends them.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with _refusal_told(path):
+        file = open(path, "wb", buffering=0)  # noqa: SIM115  # closed below
+    with file:
+        for line in lines:
+            with _refusal_told(path):
+                file.write(line.rstrip(b"\r\n") + b"\n")
+            yield line
+
+
+@contextmanager
+def _refusal_told(path: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
 
 
 def port_lines(name: str, baud: int, timeout: float) -> Iterator[bytes]:

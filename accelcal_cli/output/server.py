@@ -245,11 +245,19 @@ class Server:
         self._waking.add(changed)
         self.pages += 1
         self.opened = True
+        gone = asyncio.ensure_future(reader.read(1))  # it has nothing more to say
+
+        def wake(end: asyncio.Future[bytes]) -> None:
+            if not end.cancelled():
+                end.exception()  # looked at, or it is reported
+            changed.set()
+
+        gone.add_done_callback(wake)
         try:
             writer.transport.set_write_buffer_limits(WAITING)
             _head(writer, HTTPStatus.OK, "text/event-stream; charset=utf-8")
             sent: dict[str, int] = {}
-            while not reader.at_eof():
+            while not gone.done():
                 changed.clear()
                 for name, (version, text) in list(self._values.items()):
                     if sent.get(name) != version:
@@ -265,6 +273,7 @@ class Server:
                         continue
                 writer.write(b":\n\n")
         finally:
+            gone.cancel()
             self._waking.discard(changed)
             self.pages -= 1
             self.left = time.monotonic()
