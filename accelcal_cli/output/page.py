@@ -77,7 +77,7 @@ class LivePage:
         taken, now = status.state == "taken", time.monotonic()
         if taken:
             self.server.publish("progress", self._progress())
-        if taken or now >= self._due:
+        if taken or (self.server.pages and now >= self._due):
             self.server.publish("moment", to_mapping(moment(self.capture, status)))
             self._due = (
                 max(self._due, now - 1.0 / PER_SECOND) + 1.0 / PER_SECOND

@@ -73,9 +73,15 @@ def test_a_page_that_comes_late_gets_every_pose(page):
 def test_it_is_told_every_pose_and_fifteen_moments_a_second(page, monkeypatch):
     clock = iter(np.arange(10_000) / 200)
     monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
-    moments, poses = push(page, stream(12))  # 480 readings: 2.4 s
+    with contextlib.closing(Stream(page.server)) as listener:
+        assert listener.event()[0] == "progress"
+        moments, poses = push(page, stream(12))  # 480 readings: 2.4 s
     assert poses == 12
-    assert 36 <= moments <= 36 + 12 + 1
+    assert 35 <= moments <= 36 + 12 + 1
+
+
+def test_moments_are_made_for_pages_alone(page):
+    assert push(page, stream(12)) == (12, 12)
 
 
 def test_nothing_is_exported_before_the_end(page):
