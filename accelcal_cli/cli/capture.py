@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
@@ -142,21 +142,19 @@ def command(
         allowed[distinct_poses(allowed, poses)], round(window * rate), round(hold * rate), *stated, own_unit
     )
     replayed = port != "-" and Path(port).is_file()
-    with ExitStack() as stack:
-        page = stack.enter_context(closing(_open_page(capture, bind, web_port))) if web else None
-        if port == "-":
-            lines = serial.file_lines(sys.stdin.buffer)
-        elif replayed:
-            lines = serial.recorded_lines(port)
-        else:
-            lines = serial.port_lines(port, baud, timeout)
-        if record is not None:
-            lines = serial.copied(lines, record)
-        source = "<stdin>" if port == "-" else port
-        readings = serial.readings(lines, chosen, source, line, lambda note: options.tell([note], quiet))
-        _run(
-            capture, serial.in_time(readings, rate) if replayed else readings, output, page, result, g, quiet
-        )
+    if port == "-":
+        lines = serial.file_lines(sys.stdin.buffer)
+    elif replayed:
+        lines = serial.recorded_lines(port)
+    else:
+        lines = serial.port_lines(port, baud, timeout)
+    if record is not None:
+        lines = serial.copied(lines, record)
+    source = "<stdin>" if port == "-" else port
+    readings = serial.readings(lines, chosen, source, line, lambda note: options.tell([note], quiet))
+    readings = serial.in_time(readings, rate) if replayed else readings
+    with closing(_open_page(capture, bind, web_port)) if web else nullcontext() as page:
+        _run(capture, readings, output, page, result, g, quiet)
 
 
 def _check_page(web: bool, bind: str, web_port: int) -> None:

@@ -271,6 +271,8 @@ def test_ctrl_c_does_not_wait_for_pages(device, start):
     program = start("--port", device.name, *TIMES, "--web", "-q")
     with contextlib.closing(Page(address_of(program))) as page:
         page.until(lambda name, _: name == "progress")
+        device.send(text_of(hand(PLANNED[:1], still=40, moving=MOVING)), RATE)
+        page.until(lambda name, _: name == "moment")
         program.send_signal(signal.SIGINT)
         _, err = program.communicate(timeout=60)
     assert program.returncode == 130

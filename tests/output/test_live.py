@@ -7,6 +7,7 @@ import os
 import time
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -122,7 +123,7 @@ def test_a_terminal_is_drawn_ten_times_a_second_at_most(monkeypatch):
     monkeypatch.setattr(live.sys.stderr, "isatty", lambda: True)
     capture, status = captured(stream(1)[:20])
     clock = iter(np.arange(1000) / 200)  # a sensor of 200 readings a second
-    monkeypatch.setattr(live.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     watch = live.Watch(capture, quiet=False)
     for _ in range(400):
         watch.see(status)

@@ -7,6 +7,7 @@ import json
 import re
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,7 +73,7 @@ def test_a_page_that_comes_late_gets_every_pose(page):
 
 def test_it_is_told_every_pose_and_fifteen_moments_a_second(page, monkeypatch):
     clock = iter(np.arange(10_000) / 200)
-    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     with contextlib.closing(Stream(page.server)) as listener:
         assert listener.event()[0] == "progress"
         moments, poses = push(page, stream(12))  # 480 readings: 2.4 s
