@@ -34,6 +34,7 @@ SIBLINGS = GROUPS[0]
 INSIDE = {
     "calibration": (
         "settings",
+        "provenance",
         "distributions",
         "sample",
         "observability",
