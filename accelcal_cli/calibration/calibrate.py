@@ -139,7 +139,7 @@ def _calibrated(readings: Sequence[Readings], settings: Settings, source: str) -
                 raise DataError(f"{readings[at].source}: {fault}")
         assessment = assessed(sample, settings)
         for place, at in enumerate(group):
-            results[at] = replace(record(assessment, place), g_source=source, date=moment())
+            results[at] = dated(record(assessment, place), source)
     return [result for result in results if result is not None]
 
 
@@ -221,6 +221,11 @@ def record(assessment: Assessment, at: int) -> Calibration:
         temperature=fit.temperature,
         shared_noise=_number(np.sqrt(fit.spread.shared[at])),
     ).with_intervals(float(fit.coverage[at]))
+
+
+def dated(result: Calibration, source: str = OF_SETTINGS) -> Calibration:
+    """Return a record with the time of its making, and where its g comes from."""
+    return replace(result, g_source=source, date=moment())
 
 
 def moment() -> str:

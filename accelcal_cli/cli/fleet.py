@@ -109,7 +109,6 @@ def command(
     which stand out and how the fleet spreads; --format csv or json prints a row for each.
     Exit code 1 means that a sensor is suspect, undetermined or failed, or missed the --tolerance.
     """
-    from accelcal_cli.calibration.calibrate import moment
     from accelcal_cli.calibration.fleet import calibrate_each, calibrate_fleet, check_settings
     from accelcal_cli.calibration.settings import load_settings
     from accelcal_cli.config import load_mapping
@@ -166,11 +165,10 @@ def command(
     settings = replace(settings, g=g)
     if folder and output is not None:
         with whole_folder(output) as results:
-            date = moment()
 
             def keep(number: int, one: Calibration) -> None:
                 source = filed_g or gravity.source(one.data.get("unit"))
-                write_result(results, labels[number], replace(one, meta=kept, date=date, g_source=source))
+                write_result(results, labels[number], replace(one, meta=kept, g_source=source))
 
             fleet = run(settings, keep)
     else:
