@@ -89,6 +89,11 @@ class Browser:
         answer = self._post(f"{self.session}/print", {})
         file.write_bytes(base64.b64decode(answer))
 
+    def pdf(self, file: Path) -> None:
+        """Write the page as a person prints it, a PDF on the paper that the page asks for."""
+        answer = self.devtools("Page.printToPDF", preferCSSPageSize=True)
+        file.write_bytes(base64.b64decode(answer["data"]))
+
     def close(self) -> None:
         """End the session."""
         self._call("DELETE", self.session, None)

@@ -200,6 +200,12 @@ class GravityOptions:
 
         return local_gravity(unit, **vars(self))
 
+    def source(self, unit: str | None) -> str:
+        """Return where local gravity comes from, in words."""
+        from accelcal_cli.sensor.model import gravity_source
+
+        return gravity_source(unit, **vars(self))
+
     def stated(self) -> float | None:
         """Return the stated local gravity in m/s^2, or None when nothing was stated."""
         return self.in_unit(None)
