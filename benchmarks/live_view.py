@@ -1,7 +1,7 @@
 """What the live views of a capture cost, over a pseudo-terminal at 200 Hz: `python -m benchmarks.live_view`.
 
 Processor time of the whole command as a share of one core: without a view, with the terminal's, with the page's and
-one or four pages that listen; how many moments a second reach a page; and how long the calibration of a pose takes,
+one or four pages that listen; how many moments per second reach a page; and how long the calibration of a pose takes,
 for which no reading waits longer than the line's buffer holds.
 """
 
@@ -87,7 +87,7 @@ class Listener(threading.Thread):
 
 
 def measure(name: str, arguments: list[str], *, terminal: bool = False, pages: int = 0) -> None:
-    """Run a capture, print its share of a core and the moments a second that pages get."""
+    """Run a capture, print its share of a core and the moments per second that pages get."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     screen, error = pty.openpty() if terminal else (0, subprocess.PIPE)
