@@ -1,8 +1,8 @@
 """What the live views of a capture cost, over a pseudo-terminal at 200 Hz: `python -m benchmarks.live_view`.
 
 Processor time of the whole command as a share of one core: without a view, with the terminal's, with the page's and
-one or four pages that listen; how many moments a second reach a page; and how long the calibration of a pose takes,
-for which no reading waits longer than the line's buffer holds.
+one or four pages that listen; how many moments per second reach a page; and what the calibration after a pose takes,
+while which the readings wait in the buffer of the line.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Listener(threading.Thread):
 
 
 def measure(name: str, arguments: list[str], *, terminal: bool = False, pages: int = 0) -> None:
-    """Run a capture, print its share of a core and the moments a second that pages get."""
+    """Run a capture, print its share of a core and the moments per second that pages get."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     screen, error = pty.openpty() if terminal else (0, subprocess.PIPE)
@@ -136,14 +136,14 @@ def drain(screen: int) -> None:
 
 
 def calibration() -> None:
-    """Print how long the calibration after each pose takes."""
+    """Print the processor time of the calibration after each pose."""
     capture, times = Capture(PLANNED, RATE // 4, RATE), []
     for line in lines():
         status = capture.push(np.array([float(word) for word in line.split()]))
         if status is not None and status.state == "taken":
-            begun = time.perf_counter()
+            begun = time.process_time()
             capture.calibrate()
-            times.append(1e3 * (time.perf_counter() - begun))
+            times.append(1e3 * (time.process_time() - begun))
     rest = f"then {np.median(times[1:]):.0f} ms, at most {max(times[1:]):.0f} ms"
     print(f"calibration of a pose    {times[0]:.0f} ms the first, {rest}")
 

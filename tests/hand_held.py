@@ -59,7 +59,7 @@ class Device:
         self.name, self.slave = os.ttyname(slave), slave
 
     def send(self, data, rate=None):
-        """Send in the background, so many lines a second; a port that nobody reads any more ends it."""
+        """Send in the background, so many lines per second; a port that nobody reads any more ends it."""
 
         def chunks():
             if rate is None:

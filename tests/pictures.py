@@ -1,7 +1,7 @@
 """Draws the pictures of README and gallery anew: `python tests/pictures.py`, or `make pictures`.
 
-A terminal, a report, a log with its poses, convergence, a fleet: each made by the command that its caption names. The
-report is opened in Chromium; without one its picture stays as it is.
+A terminal, a report, a capture, a log with its poses, convergence, a fleet: each made by the command that its caption
+names. Report and capture are opened in Chromium; without one their pictures stay as they are.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import chromium
@@ -40,6 +41,8 @@ INPUTS = (
     "accelcal simulate --sensor mems --raw --positions 13 --rate 50 --hold 3 --move 1 --noise 0.02 --seed 2 -o log.csv",
     "accelcal calibrate data.csv --g 9.80665 -o result.yaml",
     "accelcal report result.yaml -o report.html",
+    "accelcal simulate --raw --sensor mems --positions 12 --scheme edges --rate 200 --hold 1 --move 1 --noise 0.01 "
+    "--seed 7 -o session.csv",
 )
 
 
@@ -76,6 +79,34 @@ def report(page: Path, path: Path) -> None:
         session.screenshot(path, whole=False)
 
 
+def capture(folder: Path) -> None:
+    """Write a picture of a capture as its page shows it, after some of the poses."""
+    browser = chromium.browser()
+    if browser is None:
+        sys.stderr.write("no chromium and chromedriver: the picture of the capture stays\n")
+        return
+    words = ["--port", "session.csv", "--rate", "200", "--window", "0.25", "--hold", "0.5", "--web", "-q"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "accelcal_cli", "capture", *words, "-o", "poses.csv"]
+    with (
+        subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) as program,
+        chromium.session(browser) as session,
+    ):
+        assert program.stderr is not None
+        session.open(program.stderr.readline().split()[-1], width=1200, height=760)
+        session.devtools("Emulation.setScrollbarsHidden", hidden=True)
+        shown = "return document.querySelectorAll('#list .taken').length"
+        while program.poll() is None and session.run(shown) < SOME_POSES:
+            time.sleep(0.1)
+        time.sleep(HELD)
+        session.screenshot(PICTURES / "capture.png", whole=False)
+        program.kill()
+
+
+SOME_POSES, HELD = 11, 1.4
+"""Poses that the picture of a capture has, and seconds after the last of them."""
+
+
 def main() -> None:
     PICTURES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
@@ -89,6 +120,7 @@ def main() -> None:
             name = command.rpartition(" ")[2]
             (PICTURES / name).write_bytes((folder / name).read_bytes())
         report(folder / "report.html", PICTURES / "report.png")
+        capture(folder)
 
 
 if __name__ == "__main__":

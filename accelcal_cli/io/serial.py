@@ -62,7 +62,7 @@ def recorded_lines(path: str) -> Iterator[bytes]:
 
 
 def in_time(readings: Iterable[Float], rate: float) -> Iterator[Float]:
-    """Yield readings as a sensor would send them, `rate` a second; none is left out where the reader is slow."""
+    """Yield readings as a sensor would send them, `rate` per second; none is left out where the reader is slow."""
     start = time.monotonic()
     for number, reading in enumerate(readings):
         wait = start + number / rate - time.monotonic()

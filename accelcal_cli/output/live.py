@@ -21,7 +21,7 @@ from accelcal_cli.output.files import check_target, is_stream, open_stream, unwr
 from accelcal_cli.output.sphere import BOX_WIDTH, MAP_WIDTH, draw_box, draw_map
 from accelcal_cli.sensor.poses import AXES, describe
 from accelcal_cli.views.blocks import wrapped
-from accelcal_cli.views.capture import Moment, Progress, moment, progress
+from accelcal_cli.views.capture import Moment, Progress, moment, progress, rounded
 
 BAR = 20
 PER_SECOND = 10
@@ -130,7 +130,7 @@ def _now(now: Moment | None, so_far: Progress, unicode: bool) -> list[Text]:
     return [
         Text(f"{axes}  |f| {now.length:.4f} g"),
         Text(f"[{full * filled}{empty * (BAR - filled)}] {now.words}", STYLES[now.state]),
-        Text(f"sd    {now.spread:.2g}, still below {now.limit:.2g}"),
+        Text(f"sd    {rounded(now.spread)}, still below {rounded(now.limit)}"),
         Text(f"held  {now.hold}"),
         Text.assemble("next  ", (following, "bold cyan")),
     ]

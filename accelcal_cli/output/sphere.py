@@ -176,8 +176,12 @@ def attitude(direction: Sequence[float]) -> Float:
     return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + z))
 
 
-AZIMUTH, ELEVATION, SIZE = math.radians(-65.0), math.radians(24.0), 0.54
+AZIMUTH, ELEVATION, SIZE = math.radians(-60.0), math.radians(20.0), 0.53
 """From where a box is seen, and half of its edge."""
+
+
+NAMED = 0.15
+"""How much of a face one has to see, as a part, for its name to have room."""
 
 
 def _camera() -> Float:
@@ -210,6 +214,8 @@ def draw_box(direction: tuple[float, float, float], *, unicode: bool) -> tuple[s
         ):
             canvas.line(SIZE * (turn @ one)[:2], SIZE * (turn @ other)[:2])
     for axis, sign in faces:
+        if sign * turn[2, axis] < NAMED:
+            continue
         x, y = SIZE * sign * turn[:2, axis]
         canvas.write(x, y, f"{'+' if sign > 0 else '-'}{AXES[axis]}")
     return tuple(canvas.lines())

@@ -170,6 +170,11 @@ def summary(result: Calibration) -> Summary:
     )
 
 
+def rounded(value: float) -> str:
+    """Return a number to two digits, without an exponent where it is not very large or small."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def final_tables(result: Calibration) -> list[dict[str, Any]]:
     """Return the tables of a finished calibration as text: title, headings, rows and notes of each."""
     return [_as_text(table) for table in (parameters(result), engineering(result), fit(result))]

@@ -29,7 +29,7 @@ NOISE = (b"\xff\xfe#garb\x00age\n", b"12;\n", b"7;0.1;0.2\n", b"\r\n", b"<script
 """What a bad line makes of a line now and then."""
 
 FEWEST_FRAMES = 8
-"""Moments a second that reach a page while other tests share the processor; on its own it is 15."""
+"""Moments per second that reach a page while other tests share the processor; on its own it is 15."""
 
 
 @pytest.fixture

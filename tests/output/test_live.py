@@ -122,7 +122,7 @@ def test_a_terminal_is_drawn_ten_times_a_second_at_most(monkeypatch):
     monkeypatch.setattr(live.sys, "stderr", io.TextIOWrapper(io.BytesIO(), "utf-8"))
     monkeypatch.setattr(live.sys.stderr, "isatty", lambda: True)
     capture, status = captured(stream(1)[:20])
-    clock = iter(np.arange(1000) / 200)  # a sensor of 200 readings a second
+    clock = iter(np.arange(1000) / 200)  # a sensor of 200 readings per second
     monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     watch = live.Watch(capture, quiet=False)
     for _ in range(400):

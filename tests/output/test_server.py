@@ -246,8 +246,8 @@ def test_pages_are_counted_and_let_go(server, monkeypatch):
             assert other.answer.status == 503
     deadline = time.monotonic() + 10
     while server.pages and time.monotonic() < deadline:
-        server.publish("moment", 2)
         time.sleep(0.02)
+    server.publish("moment", 2)
     with contextlib.closing(Stream(server)) as page:
         assert page.event() == ("moment", 2)
     assert server.opened

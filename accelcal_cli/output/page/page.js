@@ -52,7 +52,8 @@ async function act(path, stated = {}) {
   return null;
 }
 
-const figure = (value) => (value === null ? "-" : Number(value.toPrecision(5)).toString());
+/** A number to some digits, without an exponent where it is not very large or small. */
+const figure = (value, digits = 5) => (value === null ? "-" : Number(value.toPrecision(digits)).toString());
 
 function showMoment(now) {
   seen.moment = now;
@@ -69,8 +70,8 @@ function showMoment(now) {
     element(`bar-${axis}`).style.transform = `scaleX(${now.reading[k] / whole})`;
   });
   tell("length", `${now.length.toFixed(4)} g`);
-  tell("spread", now.spread.toPrecision(2));
-  tell("limit", now.limit.toPrecision(2));
+  tell("spread", figure(now.spread, 2));
+  tell("limit", figure(now.limit, 2));
   globe.follow(now.direction);
   if (globe.scene.next !== now.next) {
     globe.scene.next = now.next;

@@ -50,7 +50,7 @@ function camera(azimuth, elevation) {
   return [right, cross(eye, right), eye];
 }
 
-const BOX_CAMERA = camera((-65 * Math.PI) / 180, (24 * Math.PI) / 180);
+const BOX_CAMERA = camera((-60 * Math.PI) / 180, (20 * Math.PI) / 180);
 
 /** The sensor's axes in the world when a direction is up, by the shortest way from z up. */
 function attitude([x, y, z]) {
@@ -100,7 +100,7 @@ function drawBox(canvas, direction, colour) {
       pen.lineWidth = 2;
       pen.stroke();
       pen.fillStyle = tones.ink;
-      pen.fillText(`${sign > 0 ? "+" : "\u2212"}${AXES[axis]}`, ...at(normal));
+      if (seen(normal)[2] > 0.15) pen.fillText(`${sign > 0 ? "+" : "\u2212"}${AXES[axis]}`, ...at(normal));
     }
   }
   const [column, top] = [width - 8, height / 2]; // up is up
