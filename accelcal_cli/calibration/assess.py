@@ -215,9 +215,8 @@ def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[
         lines.insert(0, f"{poses} poses are fewer than the {number} parameters; take at least {fewest}.")
     if freedom == 0:
         number = {4: "Four"}.get(poses, number.capitalize())
-        lines.append(
-            f"{number} poses leave no degrees of freedom, so no uncertainty can be given. Take at least {fewest}."
-        )
+        left = "nothing checks the fit" if fit.spread.freedom[at] > 0 else "no uncertainty can be given"
+        lines.append(f"{number} poses leave no degrees of freedom, so {left}. Take at least {fewest}.")
     beyond = ", ".join(edge_names(fit.at_wall[at]))
     if beyond and view.verdict != "undetermined":  # of poses that leave a valley, the wall only ends it
         lines.append(f"The least cost lies outside the search box, beyond {beyond}.")

@@ -404,12 +404,12 @@ def sandwich(rows: Float, w: Float, v: Float, cofactor: Float) -> Float:
 def _satterthwaite(v: Float, w: Float, rows: Float, cofactor: Float, leverage: Float) -> Float:
     """Return the degrees of freedom of sum w e^2 where sqrt(w) e has the variances v, shape (R,) [satterthwaite1946].
 
-    (tr M V)^2 / tr (M V M V) with M = I - H, without a matrix over the poses.
+    (tr M V)^2 / tr (M V M V) with M = I - H, without a matrix over the poses. It is 1 or more but for rounding.
     """
     B = (rows * (w * v)[..., None]).swapaxes(1, 2) @ rows
     CB = cofactor @ B
     square = np.sum(v * v * (1.0 - 2.0 * leverage), axis=1) + np.einsum("rpq,rqp->r", CB, CB)
-    return np.asarray(np.sum(v * (1.0 - leverage), axis=1) ** 2 / np.maximum(square, 1e-300))
+    return np.maximum(np.sum(v * (1.0 - leverage), axis=1) ** 2 / np.maximum(square, 1e-300), 1.0)
 
 
 def noise_bias(u: Float, w: Float, covariance: Float, cofactor: Float, g: float) -> Float:

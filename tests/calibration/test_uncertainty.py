@@ -132,3 +132,18 @@ def test_sigma_of_a_robust_loss_is_the_scatter_of_its_estimates(robust):
     assert ratio.mean() == pytest.approx(1.0, abs=0.05)
     plain = calibrate(data, replace(settings, robust="none"))
     assert result.dop.worst == pytest.approx(plain.dop.worst, rel=1e-3)
+
+
+@pytest.mark.parametrize(("count", "verdict"), [(9, "weak"), (10, "good"), (11, "good")])
+def test_the_scatter_gives_the_intervals_that_few_poses_cannot(count, verdict):
+    """With one degree of freedom, too: rounding puts that at 0.9999."""
+    u = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 0], [1, 0, 1], [0, 1, 1], [-1, 1, 0], [-1, 0, 1]]])
+    u = (u / np.linalg.norm(u, axis=1, keepdims=True))[:count]
+    noise = np.random.default_rng(1).normal(0, 1e-3, u.shape)
+    output = 9.80665 * u * [1.01, 1.02, 0.99] + [0.1, 0.2, -0.1] + noise
+    scatter = np.tile([0.01, 0.0103, 0.0098], (count, 1))
+    result = calibrate(Readings.from_array(output, count=np.full(count, 100), scatter=scatter))
+    assert result.verdict == verdict
+    assert (result.interval.D_a < 2e-2).all()
+    assert np.isfinite(result.interval.K_a).all()
+    assert not any("no uncertainty" in reason for reason in result.reasons)
