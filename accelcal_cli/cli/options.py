@@ -202,9 +202,10 @@ class GravityOptions:
 
     def source(self, unit: str | None) -> str:
         """Return where local gravity comes from, in words."""
-        from accelcal_cli.sensor.model import gravity_source
+        from accelcal_cli.sensor.model import ASSUMED, gravity_source
 
-        return gravity_source(unit, **vars(self))
+        nothing = unit is None and all(value is None for value in vars(self).values())
+        return ASSUMED if nothing else gravity_source(unit, **vars(self))
 
     def stated(self) -> float | None:
         """Return the stated local gravity in m/s^2, or None when nothing was stated."""

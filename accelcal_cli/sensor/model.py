@@ -252,6 +252,10 @@ def local_gravity(
     return size if metres is None else metres * size / STANDARD_GRAVITY
 
 
+ASSUMED = "standard gravity, assumed: no local value was stated"
+"""Where local gravity comes from when nobody tells."""
+
+
 def gravity_source(
     unit: str | None = None,
     *,
@@ -273,4 +277,4 @@ def gravity_source(
         return "stated by the user"
     if unit in ("g", "mg"):
         return "the readings' own unit: 1 g is taken as the local gravity"
-    return "standard gravity, assumed: no local value was stated"
+    return ASSUMED

@@ -34,7 +34,7 @@ def parameter_tables(result: Calibration) -> list[Table]:
             value = 1 + 2 * j
             if result.held.any() and i != j:
                 row[value] = row[value + 1] = ""
-            elif result.K_a[i, j] == 0 and row[value + 1] is None:
+            elif result.K_a[i, j] == 0 and row[value + 1] in (None, 0.0):
                 row[value + 1] = ""  # a zero of the gauge is exact
     for row in cells:
         row[1:] = ["" if b is None and a == quoted.UNKNOWN else b for a, b in pairwise(row)]

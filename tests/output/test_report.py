@@ -271,6 +271,10 @@ def test_options_and_short_names_are_not_split():
     )
 
 
+def test_axes_are_not_split_from_their_signs():
+    assert str(prose("between +x and -z up")) == 'between +x and <span class="whole">-z</span> up'
+
+
 def test_results_stand_side_by_side_with_their_differences():
     first, second = _result("good"), _result("outlier")
     text = side_by_side({"before": first, "after": second}, "Desk 1")
