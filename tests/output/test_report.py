@@ -239,6 +239,12 @@ def test_without_a_curve_there_is_no_picture_of_it(good):
     assert text.count("<svg") == 3
 
 
+def test_a_record_without_poses_has_a_page(good):
+    record = {**good.record(), "poses_fit": [], "outliers": [], "convergence": []}
+    text = page(Calibration.from_record(record, "r"), "Sensor 7")
+    assert text.count("<svg") == 2
+
+
 def test_the_same_result_gives_the_same_page(good):
     again = Calibration.from_record(json.loads(json.dumps(good.record())), "r")
     assert _page("good") == page(again, "Sensor 7")
