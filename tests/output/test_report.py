@@ -22,7 +22,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import UsageError
 from accelcal_cli.io.readings import Readings
-from accelcal_cli.output import figures
+from accelcal_cli.output import certificate, figures
 from accelcal_cli.output.document import prose, typeset
 from accelcal_cli.output.report import fleet_page, page, side_by_side
 from accelcal_cli.sensor import poses
@@ -390,7 +390,7 @@ AXE = (
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("kind", ["outlier", "two", "fleet"])
+@pytest.mark.parametrize("kind", ["outlier", "two", "fleet", "certificate"])
 def test_axe_has_no_serious_finding(browser, tmp_path, kind, scheme):
     if not AXE.is_file():
         pytest.skip("no axe-core here: npm install axe-core, or ACCELCAL_AXE names its folder")
@@ -409,6 +409,7 @@ def _several(kind):
     results = {name: _result(name) for name in ("good", "outlier")}
     return {
         "outlier": lambda: _page("outlier"),
+        "certificate": lambda: certificate.page(_result("outlier"), "r"),
         "two": lambda: side_by_side(results, "Two"),
         "fleet": lambda: fleet_page({**results, **{str(k): _result("good") for k in range(4)}}, "Fleet"),
     }[kind]()
