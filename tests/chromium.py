@@ -126,8 +126,10 @@ def session(path: str) -> Iterator[Browser]:
     driver = subprocess.Popen([DRIVER, f"--port={port}"], stdin=quiet, stdout=quiet, stderr=quiet)
     try:
         found = Browser(_ready(f"http://127.0.0.1:{port}"), path)
-        yield found
-        found.close()
+        try:
+            yield found
+        finally:  # or the browser outlives its driver
+            found.close()
     finally:
         driver.terminate()
         driver.wait()

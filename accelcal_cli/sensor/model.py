@@ -253,7 +253,7 @@ def local_gravity(
 
 
 ASSUMED = "standard gravity, assumed: no local value was stated"
-"""Where local gravity comes from when nobody tells."""
+"""Where local gravity comes from when nothing says it."""
 
 
 def gravity_source(
