@@ -74,8 +74,8 @@ def report(page: Path, path: Path) -> None:
         sys.stderr.write("no chromium and chromedriver: the picture of the report stays\n")
         return
     with chromium.session(browser) as session:
-        session.open(page, width=1000, height=800)
         session.devtools("Emulation.setScrollbarsHidden", hidden=True)
+        session.open(page, width=1000, height=800)
         session.screenshot(path, whole=False)
 
 

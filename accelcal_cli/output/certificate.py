@@ -7,6 +7,7 @@ from accelcal_cli.errors import UsageError, did_you_mean
 from accelcal_cli.output import figures
 from accelcal_cli.output.document import render
 from accelcal_cli.views import certificate as views
+from accelcal_cli.views.report import engineering
 
 PAPERS = {"a4": "A4", "letter": "letter"}
 """Sizes of paper by name, as CSS calls them. The sides fit on either."""
@@ -46,7 +47,7 @@ def page(result: Calibration, name: str, title: str | None = None, paper: str = 
         conditions=views.conditions(result),
         coverage=views.coverage(result),
         matrix=views.matrix(result),
-        engineering=views.engineering(result),
+        engineering=engineering(result),
         fit=views.fit(result),
         hashes=views.hashes(result),
         sphere=Markup(figures.sphere(result)),

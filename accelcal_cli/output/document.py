@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 RAISED = (("m/s^2", "m/s\u00b2"), (")^4", ")\u2074"), ("(g)\u2074", "g\u2074"), ("+- 95 %", "\u00b1 95 %"))
 
 OPTION = re.compile(r"(?<![\w-])(--[a-z][\w-]*)")
-NAME = re.compile(r"(?<![\w>-])([a-z]{1,12}(?:-[a-z0-9]{1,12}){1,2})(?![\w-])")
-"""Options of the command line, and short names with hyphens as de-pso: no line may end within."""
+NAME = re.compile(r"(?<![\w>-])([a-z]{1,12}(?:-[a-z0-9]{1,12}){1,2}|-[xyz])(?![\w-])")
+"""Options of the command line, and short names with hyphens as de-pso and -x: no line may end within."""
 
 
 def check_packages() -> None:

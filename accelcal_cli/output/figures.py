@@ -37,8 +37,10 @@ NAMED = 6
 
 
 def residuals(result: Calibration, name: str = "residuals", of: str = "") -> str:
-    """Return |f| - g of every kept pose before and after calibration, one panel each."""
+    """Return |f| - g of every kept pose before and after calibration, one panel each; empty without poses."""
     fits, titles = result.poses_fit, pose_names(result)
+    if not fits:
+        return ""
     x = Scale(min(p.pose for p in fits) + 0.4, max(p.pose for p in fits) + 1.6, LEFT, WIDTH - RIGHT)
     panels = (
         ("before calibration", "before", [p.residual_before for p in fits]),
@@ -178,7 +180,7 @@ def dilution(result: Calibration, name: str = "dilution") -> str:
     dop = [result.dop.parameters[one] for one in names]
     known = [d for d in dop if math.isfinite(d)]
     end = 1.3 * max(UNDETERMINED, *known) if known else 1.3 * UNDETERMINED
-    start = min([0.1, *(0.5 * d for d in known)])
+    start = max(min([0.1, *(0.5 * d for d in known)]), 1e-3)
     left, top, row = 100.0, 34.0, 19.0
     bottom = top + row * len(names)
     x = Scale(start, end, left, WIDTH - 46, log=True)

@@ -22,7 +22,7 @@ from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.poses import AXES
 from accelcal_cli.views import quoted
 from accelcal_cli.views.blocks import Column, Table
-from accelcal_cli.views.report import NOT_ESTIMATED, dated, determined, gravity
+from accelcal_cli.views.report import dated, determined, gravity, two_digits
 
 SIMPLE, IN_TABLE = 55, 12
 """Width of a value, and entries of the identification, that stand in a table; others stand one behind the other."""
@@ -244,36 +244,13 @@ def matrix(result: Calibration) -> Table:
                 continue
             shown, spread = quoted.quote(float(values[i, j]), float(halves[i, j]))
             cells.append(f"{shown} {quoted.PLUS_MINUS} {spread}" if spread else shown)
-            cells.append(_two_digits(float(sigmas[i, j])) if spread else "")
+            cells.append(two_digits(float(sigmas[i, j])) if spread else "")
         rows.append(tuple(cells))
     columns = [Column("axis")]
     for name in ("K_x", "K_y", "K_z", "bias"):
         columns += [Column(name), Column("sigma")]
     note = f"K in output units per {result.unit}, bias in output units, gauge {result.gauge}."
     return Table(f"K and bias D of N = K f + D, {quoted.QUOTED}", tuple(columns), tuple(rows), (note,))
-
-
-def _two_digits(sigma: float) -> str:
-    """Return a sigma as intervals are quoted; nothing without one."""
-    return quoted.quote(0.0, sigma)[1]
-
-
-def engineering(result: Calibration) -> Table:
-    """Return the parameters that were estimated in engineering units, with sigma and 95 % intervals."""
-    table = quoted.engineering(result)
-    _, intervals = quoted.in_parts(result)
-    rows = []
-    for p, (name, shown, other) in enumerate(table.rows):
-        if result.held[p]:
-            continue
-        size = quoted.kinds(result)[p // 3][2]
-        sigma = intervals[p] * size / result.coverage_factor if result.coverage_factor else math.nan
-        rows.append((name, shown, _two_digits(sigma), other))
-    parameter, value, further = table.columns
-    notes = (*table.notes, NOT_ESTIMATED) if result.held.any() else table.notes
-    return Table(
-        "Parameters, " + quoted.QUOTED, (parameter, value, Column("sigma"), further), tuple(rows), notes
-    )
 
 
 def fit(result: Calibration) -> list[tuple[str, str]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,7 +10,7 @@ from accelcal_cli import __version__
 from accelcal_cli.calibration.provenance import settings_sha256
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.views import calibration, quoted
-from accelcal_cli.views.blocks import Table
+from accelcal_cli.views.blocks import Column, Table
 
 NOT_ESTIMATED = (
     "Misalignments were not estimated: the sensor axes are taken as perpendicular (--no-misalignment), and what "
@@ -28,27 +27,42 @@ def determined(result: Calibration) -> str:
 
 def parameter_tables(result: Calibration) -> list[Table]:
     """Return the tables of the parameters that were estimated; those that were not have no row and no number."""
-    first, second, *rest = calibration.parameter_tables(result)
+    first, _, *rest = calibration.parameter_tables(result)
     cells = [list(row) for row in first.rows]
     for i, row in enumerate(cells):
         for j in range(3):
             value = 1 + 2 * j
             if result.held.any() and i != j:
                 row[value] = row[value + 1] = ""
-            elif result.K_a[i, j] == 0 and row[value + 1] is None:
+            elif result.K_a[i, j] == 0 and row[value + 1] in (None, 0.0):
                 row[value + 1] = ""  # a zero of the gauge is exact
     for row in cells:
         row[1:] = ["" if b is None and a == quoted.UNKNOWN else b for a, b in pairwise(row)]
     first = replace(first, rows=tuple(cells))
-    estimated = [not held for held in result.held.tolist()]
-    rows = tuple(_known(row) for row, shown in zip(second.rows, estimated, strict=True) if shown)
-    notes = (*second.notes, NOT_ESTIMATED) if result.held.any() else second.notes
-    return [first, replace(second, rows=rows, notes=notes), *rest]
+    return [first, engineering(result), *rest]
 
 
-def _known(row: Sequence[object]) -> Sequence[object]:
-    """Return a row of the engineering view, without units where there is no number."""
-    return [row[0], quoted.UNKNOWN, *[""] * (len(row) - 2)] if quoted.UNKNOWN in row else row
+def two_digits(sigma: float) -> str:
+    """Return a sigma as intervals are quoted; nothing without one."""
+    return quoted.quote(0.0, sigma)[1]
+
+
+def engineering(result: Calibration) -> Table:
+    """Return the parameters that were estimated in engineering units, with sigma and 95 % intervals."""
+    table = quoted.engineering(result)
+    _, intervals = quoted.in_parts(result)
+    rows = []
+    for p, (name, shown, other) in enumerate(table.rows):
+        if result.held[p]:
+            continue
+        size = quoted.kinds(result)[p // 3][2]
+        sigma = intervals[p] * size / result.coverage_factor if result.coverage_factor else math.nan
+        rows.append((name, shown, two_digits(sigma), other))
+    parameter, value, further = table.columns
+    notes = (*table.notes, NOT_ESTIMATED) if result.held.any() else table.notes
+    return Table(
+        "Parameters, " + quoted.QUOTED, (parameter, value, Column("sigma"), further), tuple(rows), notes
+    )
 
 
 def observability(result: Calibration) -> Table:

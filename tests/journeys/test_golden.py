@@ -324,6 +324,7 @@ def written(line: str) -> str:
     path = Path(words[words.index("-o") + 1])
     if path.suffix == ".html" and path.exists():
         page = re.sub(r"<(style|script|svg)\b.*?</\1>", " ", path.read_text(), flags=re.DOTALL)
+        page = re.sub(r"</?(code|span)\b[^>]*>", "", page)
         text = re.sub(r"[ \t]*\n\s*", "\n", html.unescape(re.sub(r"<[^>]+>", "\n", page))).strip()
         return f"--- {path}\n{text}\n"
     if path.is_dir():

@@ -22,7 +22,7 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import UsageError
 from accelcal_cli.io.readings import Readings
-from accelcal_cli.output import figures
+from accelcal_cli.output import certificate, figures
 from accelcal_cli.output.document import prose, typeset
 from accelcal_cli.output.report import fleet_page, page, side_by_side
 from accelcal_cli.sensor import poses
@@ -239,6 +239,12 @@ def test_without_a_curve_there_is_no_picture_of_it(good):
     assert text.count("<svg") == 3
 
 
+def test_a_record_without_poses_has_a_page(good):
+    record = {**good.record(), "poses_fit": [], "outliers": [], "convergence": []}
+    text = page(Calibration.from_record(record, "r"), "Sensor 7")
+    assert text.count("<svg") == 2
+
+
 def test_the_same_result_gives_the_same_page(good):
     again = Calibration.from_record(json.loads(json.dumps(good.record())), "r")
     assert _page("good") == page(again, "Sensor 7")
@@ -259,14 +265,20 @@ def test_what_is_not_determined_has_no_number():
     text = Reader(_page("undetermined")).text
     assert "not determined" in text
     assert "noise of one pose, s" in text  # twelve poses of six attitudes have degrees of freedom
-    row = re.search(r"<tr>\s*<th[^>]*>misalignment xy</th>(.*?)</tr>", _page("undetermined"), re.DOTALL)[1]
-    assert re.findall(r">([^<]*)</td>", row) == ["not determined", "", "", "", "", ""]
+    row = re.search(
+        r"<tr>\s*<th[^>]*>misalignment xy \[mrad\]</th>(.*?)</tr>", _page("undetermined"), re.DOTALL
+    )[1]
+    assert re.findall(r">([^<]*)</td>", row) == ["not determined", "", ""]
 
 
 def test_options_and_short_names_are_not_split():
     assert str(prose("add --no-misalignment, de-pso <x>")) == (
         'add <code>--no-misalignment</code>, <span class="whole">de-pso</span> &lt;x&gt;'
     )
+
+
+def test_axes_are_not_split_from_their_signs():
+    assert str(prose("between +x and -z up")) == 'between +x and <span class="whole">-z</span> up'
 
 
 def test_results_stand_side_by_side_with_their_differences():
@@ -378,7 +390,7 @@ AXE = (
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("kind", ["outlier", "two", "fleet"])
+@pytest.mark.parametrize("kind", ["outlier", "two", "fleet", "certificate"])
 def test_axe_has_no_serious_finding(browser, tmp_path, kind, scheme):
     if not AXE.is_file():
         pytest.skip("no axe-core here: npm install axe-core, or ACCELCAL_AXE names its folder")
@@ -397,6 +409,7 @@ def _several(kind):
     results = {name: _result(name) for name in ("good", "outlier")}
     return {
         "outlier": lambda: _page("outlier"),
+        "certificate": lambda: certificate.page(_result("outlier"), "r"),
         "two": lambda: side_by_side(results, "Two"),
         "fleet": lambda: fleet_page({**results, **{str(k): _result("good") for k in range(4)}}, "Fleet"),
     }[kind]()
