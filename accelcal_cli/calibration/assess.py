@@ -296,12 +296,11 @@ def _fewest_attitudes(fit: Fit) -> int:
 
 def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[Notice, ...]:
     """Return what is said of a sensor, the gravest first."""
-    readings, settings = fit.sample.readings(at), fit.settings
-    s, freedom = float(fit.s[at]), int(fit.freedom[at])
-    where = [readings.where(pose) for pose in outliers]
+    settings, s, freedom = fit.settings, float(fit.s[at]), int(fit.freedom[at])
+    where = [fit.sample.where(at, pose) for pose in outliers]
     loss: Loss = "known" if fit.solution is None else "plain" if settings.robust == "none" else "robust"
     lines = [
-        *readings.warnings,
+        *fit.sample.warnings(at),
         *_few_attitudes(fit, at),
         *not_fitting(where, freedom, loss),
         *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
@@ -571,11 +570,10 @@ def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return a note of axes that the fit has the other way round than most labels that say which way is up."""
     if fit.view[at].verdict == "undetermined":
         return ()
-    readings, residuals = fit.sample.readings(at), fit.residuals
-    real = residuals.real[at]
+    residuals, real = fit.residuals, fit.residuals.real[at]
     votes = np.zeros((3, 2), dtype=int)  # of each axis: labels that the fit bears out, and others
     for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
-        said = axis_up(readings.where(pose))
+        said = axis_up(fit.sample.where(at, pose))
         if said is not None:
             axis, up = said
             part = up * float(force[axis]) / fit.settings.g

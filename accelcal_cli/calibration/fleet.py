@@ -279,9 +279,8 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
     outlying = np.full(len(sample), "", dtype=object)
     for at, poses in enumerate(assessment.outliers):
         if poses:
-            readings = sample.readings(at)
             more = f" and {len(poses) - NAMED} more" if len(poses) > NAMED else ""
-            outlying[at] = ", ".join(readings.where(pose) for pose in poses[:NAMED]) + more
+            outlying[at] = ", ".join(sample.where(at, pose) for pose in poses[:NAMED]) + more
     return Fleet(
         number=number,
         poses=sample.poses,

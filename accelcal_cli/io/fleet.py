@@ -123,8 +123,9 @@ class FleetReadings:
         origin = self.origin(pose)
         return origin.where(pose - origin.first)
 
-    def one(self, batch: Batch, at: int) -> Readings:
-        """Return the readings of the sensor at `at` in a batch, as `calibrate` takes them."""
+    def one(self, batch: Batch, at: int, *, screened: bool = True) -> Readings:
+        """Return the readings of the sensor at `at` in a batch, as `calibrate` takes them; those that are not doubtful
+        need not be screened."""
         count, poses = int(batch.count[at]), batch.pose[at]
         origin, name = self.origin(int(poses[0])), self.sensors[batch.sensors[at]]
         return Readings.from_array(
@@ -133,7 +134,7 @@ class FleetReadings:
             count=_known(batch.behind, at, count),
             scatter=_known(batch.scatter, at, count),
             cross=_known(batch.cross, at, count),
-            warnings=self.warnings(batch, at),
+            warnings=self.warnings(batch, at) if screened else (),
         ).known_as(
             origin.sha256,
             origin.columns,
