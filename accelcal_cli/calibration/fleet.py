@@ -273,9 +273,6 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
     """Return the part of a fleet that an assessment tells of."""
     fit, sample, settings = assessment.fit, assessment.fit.sample, assessment.fit.settings
 
-    def texts(lines: list[tuple[str, ...]]) -> np.ndarray:
-        return np.array([" ".join(own) for own in lines], dtype=object)
-
     outlying = np.full(len(sample), "", dtype=object)
     for at, poses in enumerate(assessment.outliers):
         if poses:
@@ -298,7 +295,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         rms_before=fit.rms_before,
         freedom=np.broadcast_to(fit.freedom, sample.poses.shape),
         verdict=np.array(assessment.verdicts, dtype=object),
-        reason=texts(assessment.reasons),
+        reason=np.array([" ".join(own) for own in assessment.reasons], dtype=object),
         warnings=_objects(assessment.warnings),
         outlying=outlying,
     )
@@ -306,10 +303,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
 
 def _objects(values: Sequence[object]) -> np.ndarray:
     """Return values, tuples too, as an array of one dimension."""
-    array = np.empty(len(values), dtype=object)
-    for at, value in enumerate(values):
-        array[at] = value
-    return array
+    return np.fromiter(values, dtype=object, count=len(values))
 
 
 def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:

@@ -28,8 +28,9 @@ from accelcal_cli.notices import Notice
 SLAB = 2_000_000
 """Poses that are in memory at once, unless one sensor has more."""
 
-BATCH = 16_384
-"""Poses of a batch at most, unless one sensor has more: few enough for the processor's caches."""
+BATCH = 32_768
+"""Poses of a batch at most, unless one sensor has more: arrays that a third-level cache holds, and so many sensors that
+the interpreter is a small part."""
 
 STRETCH = 1.25
 """No sensor of a batch has more than so many times the poses of another."""
