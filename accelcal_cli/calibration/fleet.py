@@ -6,7 +6,7 @@ determine the ellipsoid, the start is the least cost itself, and the solver conf
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -173,14 +173,11 @@ def check_settings(settings: Settings, *, each: bool = False) -> None:
     """Refuse what is not done for a fleet, or where `each` sensor is calibrated by itself (`calibrate_each`).
 
     Raises:
-        ConfigError: known attitudes, gauge `full`, several runs; a robust loss or weights "auto" for all at once.
+        ConfigError: gauge `full`, several runs; known attitudes for all at once.
     """
     for key, allowed in {
         "optimizer": ("levenberg-marquardt",),
-        "robust": ("none", "huber", "soft-l1") if each else ("none",),
-        "weights": ("none", "n", "sd", *(("auto",) if each else ())),
-        "attitudes": ("unknown",),
-        "misalignment": (True,),
+        "attitudes": ("unknown", "known") if each else ("unknown",),
         "gauge": ("lower", "upper", "symmetric"),
         "runs": (1,),
         "polish": (True,),
@@ -218,17 +215,38 @@ def calibrate_fleet(
             bad = np.array([bool(word) for word in words])
             parts.append(_failed(numbers[bad], sample.poses[bad], [word for word in words if word]))
             sample, numbers = sample.take(np.flatnonzero(~bad)), numbers[~bad]
-        if len(numbers):
-            assessment = assessed(sample, settings, closed=True)
-            parts.append(_part(assessment, numbers))
+        for own, at in _together(sample, settings):
+            assessment = assessed(own, settings, closed=_is_closed(settings))
+            parts.append(_part(assessment, numbers[at]))
             if keep is not None:
-                for at, number in enumerate(numbers.tolist()):
-                    keep(number, record(assessment, at))
+                for place, number in enumerate(numbers[at].tolist()):
+                    keep(number, record(assessment, place))
     fleet = _joined(parts)
     if all(reason.startswith("--weights") for reason in fleet.reason):
         label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
         raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
     return fleet
+
+
+def _is_closed(settings: Settings) -> bool:
+    """Whether the least cost is that of the closed form: six unknowns are not those of an ellipsoid, which has nine.
+
+    And the rounds of a robust loss go on from where the search of one sensor ends, to the last digit.
+    """
+    return settings.misalignment and settings.robust == "none"
+
+
+def _together(sample: Sample, settings: Settings) -> Iterator[tuple[Sample, slice]]:
+    """Yield the sensors that go through the flow together, and their places in the sample.
+
+    A robust loss, and weights by an error that poses share, have rounds of their own for every sensor.
+    """
+    if settings.robust == "none" and settings.weights != "auto":
+        if len(sample):
+            yield sample, slice(None)
+        return
+    for at in range(len(sample)):
+        yield sample.alone(at), slice(at, at + 1)
 
 
 def calibrate_each(

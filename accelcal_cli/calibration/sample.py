@@ -213,6 +213,18 @@ class Sample:
             **parts,
         )
 
+    def alone(self, at: int) -> Sample:
+        """Return the sensor number `at` by itself, without repetitions of its last pose."""
+        one, poses = self.take(np.array([at])), int(self.poses[at])
+        parts = {
+            name: None if (value := getattr(one, name)) is None else value[:, :poses]
+            for name in ("count", "scatter", "cross", "reference", "temperature")
+        }
+        blocks = one.blocks
+        return replace(
+            one, blocks=lambda: ((first, block[:, : poses - first]) for first, block in blocks()), **parts
+        )
+
     def with_output(self, output: Float) -> Sample:
         """Return the same poses with other outputs, shape (R, J, 3)."""
         lower, upper = output.min(axis=1), output.max(axis=1)

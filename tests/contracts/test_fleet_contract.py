@@ -188,6 +188,27 @@ def _plain(value: object) -> object:
     return re.sub(r"[\w./-]+\.csv,? line", "line", value) if isinstance(value, str) else value
 
 
+MORE = (
+    {"robust": "huber"},
+    {"robust": "soft-l1", "weights": "n"},
+    {"weights": "auto"},
+    {"misalignment": False},
+)
+"""What a fleet does beside weights, of every tenth sensor."""
+
+
+@pytest.mark.parametrize("more", MORE, ids=str)
+def test_a_fleet_does_what_one_sensor_is_asked_for(devices, more):
+    settings = Settings(**{"optimizer": "levenberg-marquardt", "g": G, **more})
+    part = [path for one, path in devices if one.kind != "labels"][MORE.index(more) :: 7]
+    wrong = [
+        f"{path.stem}: {difference}"
+        for path, record in zip(part, as_fleet(part, settings), strict=True)
+        for difference in differences(record, by_itself(path, settings))
+    ]
+    assert not wrong, "\n".join([f"{len(wrong)} differences", *wrong])
+
+
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_a_fleet_is_calibrated_as_its_sensors_one_by_one(devices, weights):
     settings = Settings(optimizer="levenberg-marquardt", g=G, weights=weights)
