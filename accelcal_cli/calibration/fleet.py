@@ -170,14 +170,14 @@ def fleet(
 
 
 def check_settings(settings: Settings, *, each: bool = False) -> None:
-    """Refuse what is not done for a fleet, or where `each` sensor is calibrated by itself (`calibrate_each`).
+    """Refuse what is not done for a fleet; `each` sensor by itself, of a log (`calibrate_each`), has no attitudes.
 
     Raises:
-        ConfigError: gauge `full`, several runs; known attitudes for all at once.
+        ConfigError: another optimizer, gauge `full`, several runs.
     """
     for key, allowed in {
         "optimizer": ("levenberg-marquardt",),
-        "attitudes": ("unknown", "known") if each else ("unknown",),
+        "attitudes": ("unknown",) if each else ("unknown", "known"),
         "gauge": ("lower", "upper", "symmetric"),
         "runs": (1,),
         "polish": (True,),
@@ -215,8 +215,15 @@ def calibrate_fleet(
             bad = np.array([bool(word) for word in words])
             parts.append(_failed(numbers[bad], sample.poses[bad], [word for word in words if word]))
             sample, numbers = sample.take(np.flatnonzero(~bad)), numbers[~bad]
+        if not settings.temperature:
+            sample = replace(sample, temperature=None)
         for own, at in _together(sample, settings):
-            assessment = assessed(own, settings, closed=_is_closed(settings))
+            try:
+                assessment = assessed(own, settings, closed=_is_closed(settings))
+            except DataError as error:  # of known attitudes, which are one sensor's
+                why = str(error).removeprefix(f"{own.readings(0).source}: ")
+                parts.append(_failed(numbers[at], own.poses, [why]))
+                continue
             parts.append(_part(assessment, numbers[at]))
             if keep is not None:
                 for place, number in enumerate(numbers[at].tolist()):
@@ -239,9 +246,10 @@ def _is_closed(settings: Settings) -> bool:
 def _together(sample: Sample, settings: Settings) -> Iterator[tuple[Sample, slice]]:
     """Yield the sensors that go through the flow together, and their places in the sample.
 
-    A robust loss, and weights by an error that poses share, have rounds of their own for every sensor.
+    A robust loss, weights by an error that poses share, and slopes have rounds of their own for every sensor.
     """
-    if settings.robust == "none" and settings.weights != "auto":
+    alone = settings.robust != "none" or settings.weights == "auto" or settings.attitudes == "known"
+    if not alone and sample.temperature is None:
         if len(sample):
             yield sample, slice(None)
         return

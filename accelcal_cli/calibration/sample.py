@@ -166,6 +166,8 @@ class Sample:
             count=batch.behind,
             scatter=batch.scatter,
             cross=batch.cross,
+            reference=batch.reference,
+            temperature=batch.temperature,
         )
 
     def __len__(self) -> int:
@@ -216,13 +218,18 @@ class Sample:
     def alone(self, at: int) -> Sample:
         """Return the sensor number `at` by itself, without repetitions of its last pose."""
         one, poses = self.take(np.array([at])), int(self.poses[at])
-        parts = {
-            name: None if (value := getattr(one, name)) is None else value[:, :poses]
-            for name in ("count", "scatter", "cross", "reference", "temperature")
-        }
-        blocks = one.blocks
+
+        def cut(values: Float | None) -> Float | None:
+            return None if values is None else values[:, :poses]
+
         return replace(
-            one, blocks=lambda: ((first, block[:, : poses - first]) for first, block in blocks()), **parts
+            one,
+            blocks=lambda: ((first, block[:, : poses - first]) for first, block in one.blocks()),
+            count=cut(one.count),
+            scatter=cut(one.scatter),
+            cross=cut(one.cross),
+            reference=cut(one.reference),
+            temperature=cut(one.temperature),
         )
 
     def with_output(self, output: Float) -> Sample:
