@@ -40,7 +40,7 @@ G = 9.80665
 LOOPED = 200
 """Sensors that the loops over SciPy calibrate."""
 
-REPEAT = 3
+REPEAT = 5
 SETTINGS = Settings(optimizer="levenberg-marquardt", g=G)
 POSES = {"12 poses evenly spread": fibonacci(12), "6 faces and 6 edges": faces_edges()}
 
