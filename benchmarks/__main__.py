@@ -14,6 +14,7 @@ BENCHMARKS = (
     "detect_speed",
     "apply_speed",
     "fleet_speed",
+    "live_view",
 )
 
 

@@ -89,6 +89,11 @@ class Browser:
         answer = self._post(f"{self.session}/print", {})
         file.write_bytes(base64.b64decode(answer))
 
+    def pdf(self, file: Path) -> None:
+        """Write the page as a person prints it, a PDF on the paper that the page asks for."""
+        answer = self.devtools("Page.printToPDF", preferCSSPageSize=True)
+        file.write_bytes(base64.b64decode(answer["data"]))
+
     def close(self) -> None:
         """End the session."""
         self._call("DELETE", self.session, None)
@@ -121,8 +126,10 @@ def session(path: str) -> Iterator[Browser]:
     driver = subprocess.Popen([DRIVER, f"--port={port}"], stdin=quiet, stdout=quiet, stderr=quiet)
     try:
         found = Browser(_ready(f"http://127.0.0.1:{port}"), path)
-        yield found
-        found.close()
+        try:
+            yield found
+        finally:  # or the browser outlives its driver
+            found.close()
     finally:
         driver.terminate()
         driver.wait()

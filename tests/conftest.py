@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import hypothesis
@@ -9,6 +10,9 @@ import pytest
 
 hypothesis.settings.register_profile("accelcal", deadline=None, max_examples=25, derandomize=True)
 hypothesis.settings.load_profile("accelcal")
+
+os.environ["SOURCE_DATE_EPOCH"] = "1764547200"
+"""Results that are compared have one date, whenever they are made."""
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 """Real recordings, kept beside the project and not part of it."""

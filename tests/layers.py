@@ -34,6 +34,7 @@ SIBLINGS = GROUPS[0]
 INSIDE = {
     "calibration": (
         "settings",
+        "provenance",
         "distributions",
         "sample",
         "observability",
@@ -51,7 +52,7 @@ INSIDE = {
         "fleet",
         "apply",
     ),
-    "verification": ("shift", "verify"),
+    "verification": ("difference", "shift", "verify"),
 }
 """The files of a package in which the flow has an order, the lowest first; each imports only those before it."""
 

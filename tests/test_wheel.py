@@ -56,6 +56,11 @@ def test_the_wheel_holds_the_configurations(wheel):
     assert shipped <= set(names)
     assert "accelcal_cli/py.typed" in names
     assert "accelcal_cli/output/templates/report.html.jinja" in names
+    page = {
+        f"accelcal_cli/output/page/{name}"
+        for name in ("index.html", "page.css", "page.js", "picture.js", "icon.svg")
+    }
+    assert page <= set(names)
     assert not [name for name in names if name.startswith(("tests", "docs", "configs", "benchmarks"))]
 
 

@@ -5,7 +5,9 @@ Every stage takes one object, of R sensors at once, and returns one; a single se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from typing import Any
 
@@ -21,17 +23,28 @@ from accelcal_cli.calibration.search import Search, reweight, search, state
 from accelcal_cli.calibration.settings import Settings, load_settings, weights_of_log
 from accelcal_cli.errors import ConfigError, DataError
 from accelcal_cli.io.readings import Data, Readings, read_readings
-from accelcal_cli.sensor.model import local_gravity
+from accelcal_cli.sensor.model import gravity_source, local_gravity
 
 CURVE_POINTS = 120
 """Points kept of the convergence curve."""
+
+PLACE = ("g", "latitude", "height")
+"""Keys that state local gravity."""
+
+OF_SETTINGS = "taken from the settings"
+"""Where g comes from that settings hold, who may have it from anywhere."""
 
 TOGETHER = 16_384
 """Poses that are calibrated at once, unless one sensor has more: few enough for the processor's caches."""
 
 
 def calibrate(
-    data: Data, settings: Settings | None = None, *, columns: Sequence[str] | None = None, **keys: Any
+    data: Data,
+    settings: Settings | None = None,
+    *,
+    columns: Sequence[str] | None = None,
+    meta: Mapping[str, str] | None = None,
+    **keys: Any,
 ) -> Calibration:
     """Calibrate one sensor.
 
@@ -39,13 +52,13 @@ def calibrate(
         data: J static poses: a file, an array of outputs, shape (J, 3), a frame of polars, pandas or Arrow, readings,
             or the detection of a log, whose poses are weighted by their scatter.
         settings: model, box, optimizer, robustness; the defaults when None.
-        columns: see `read_readings`.
+        columns: see `read_readings`; meta: what the result is to keep of the sensor, as its serial number.
         keys: fields of `Settings` to change, and `latitude` with `height` in place of `g`. Without `g` readings that
             their file states in units of g or mg are taken so, and all others with 9.80665 m/s^2.
 
     Raises:
         DataError: readings without any information (all equal, fewer than two), or without the weights asked for.
-        ConfigError: unknown setting, optimizer or parameter.
+        ConfigError: unknown setting, optimizer or parameter, or a meta that is not allowed.
 
     Examples:
         >>> from accelcal_cli import calibrate, simulate
@@ -56,7 +69,12 @@ def calibrate(
         >>> result.apply(readings).shape
         (24, 3)
     """
-    return calibrate_many([data], settings, columns=columns, **keys)[0]
+    (result,) = calibrate_many([data], settings, columns=columns, **keys)
+    if not meta:
+        return result
+    from accelcal_cli.calibration.provenance import check_meta
+
+    return replace(result, meta=check_meta(meta, "meta: "))
 
 
 def calibrate_many(
@@ -82,20 +100,23 @@ def calibrate_many(
     """
     readings = [one if isinstance(one, Readings) else read_readings(one, columns) for one in data]
     if settings is not None and not keys:
-        return _calibrated(readings, settings)
+        return _calibrated(readings, settings, OF_SETTINGS)
     results: dict[int, Calibration] = {}
     kinds: dict[tuple[str | None, bool], list[int]] = {}
     for at, (one, given) in enumerate(zip(readings, data, strict=True)):
         kinds.setdefault((one.form.unit, one is not given and hasattr(given, "readings")), []).append(at)
     for (unit, of_log), numbers in kinds.items():
         own = _settled(settings, unit, dict(keys), of_log=of_log)
-        results |= zip(numbers, _calibrated([readings[at] for at in numbers], own), strict=True)
+        place = {name: keys.get(name) for name in PLACE}
+        source = OF_SETTINGS if settings and not any(place.values()) else gravity_source(unit, **place)
+        made = _calibrated([readings[at] for at in numbers], own, source)
+        results |= zip(numbers, made, strict=True)
     return [results[at] for at in range(len(readings))]
 
 
 def _settled(settings: Settings | None, unit: str | None, keys: dict[str, Any], *, of_log: bool) -> Settings:
     """Return the settings for readings in a unit, from a log or not, with keys that are stated beside them."""
-    place = {name: keys.pop(name, None) for name in ("latitude", "height")}
+    place = {name: keys.pop(name, None) for name in PLACE[1:]}
     stated = dict(keys)
     if of_log and settings is None:
         stated.setdefault("weights", weights_of_log(keys))
@@ -109,7 +130,7 @@ def _settled(settings: Settings | None, unit: str | None, keys: dict[str, Any], 
     return replace(settings, **stated)
 
 
-def _calibrated(readings: Sequence[Readings], settings: Settings) -> list[Calibration]:
+def _calibrated(readings: Sequence[Readings], settings: Settings, source: str) -> list[Calibration]:
     results: list[Calibration | None] = [None] * len(readings)
     for group in _groups(readings, settings):
         sample = Sample.of([readings[at] for at in group])
@@ -118,7 +139,7 @@ def _calibrated(readings: Sequence[Readings], settings: Settings) -> list[Calibr
                 raise DataError(f"{readings[at].source}: {fault}")
         assessment = assessed(sample, settings)
         for place, at in enumerate(group):
-            results[at] = record(assessment, place)
+            results[at] = dated(record(assessment, place), source)
     return [result for result in results if result is not None]
 
 
@@ -202,6 +223,18 @@ def record(assessment: Assessment, at: int) -> Calibration:
     ).with_intervals(float(fit.coverage[at]))
 
 
+def dated(result: Calibration, source: str = OF_SETTINGS) -> Calibration:
+    """Return a record with the time of its making, and where its g comes from."""
+    return replace(result, g_source=source, date=moment())
+
+
+def moment() -> str:
+    """Return the time, UTC, ISO 8601 to the second; SOURCE_DATE_EPOCH, seconds since 1970, stands in for the clock."""
+    stated = os.environ.get("SOURCE_DATE_EPOCH", "")
+    seconds = int(stated) if stated.isascii() and stated.isdigit() and len(stated) < 12 else None
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+
+
 def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
@@ -211,6 +244,9 @@ def _origin(readings: Readings) -> dict[str, object]:
     form = asdict(readings.form)
     if form["correction"] is None:
         del form["correction"]
+    warmth = readings.temperature
+    if warmth is not None and np.isfinite(warmth).any():
+        form["temperature"] = [float(of(warmth)) for of in (np.nanmin, np.nanmean, np.nanmax)]
     return {**named, **form}
 
 

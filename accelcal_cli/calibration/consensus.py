@@ -42,7 +42,7 @@ OPEN = 1e-15
 TRIMMED = 0.607
 """Standard deviation of the smaller three quarters of normal residuals, over that of all."""
 
-SPREAD = 0.5 * np.log(2.0 * np.pi * np.e)
+SPREAD = 0.5 * (1.0 + np.log(2.0 * np.pi))
 """-log likelihood of a normal value of standard deviation 1, on average."""
 
 

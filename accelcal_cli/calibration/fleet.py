@@ -16,7 +16,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.assess import Assessment
-from accelcal_cli.calibration.calibrate import assessed, record
+from accelcal_cli.calibration.calibrate import assessed, dated, record
 from accelcal_cli.calibration.distributions import chi_square_chance, student_chance
 from accelcal_cli.calibration.observability import (
     PARAMETERS,
@@ -103,6 +103,40 @@ class Fleet:
     warnings: np.ndarray
     outlying: np.ndarray
     labels: np.ndarray = field(default_factory=lambda: np.array([], dtype=object))
+
+    @classmethod
+    def of(cls, results: Sequence[Calibration]) -> Fleet:
+        """Return the fleet that records of sensors make, at least one, all with forces of one unit."""
+        lost = np.array([one.lost for one in results])
+        named = [[fit.where for fit in one.poses_fit if fit.pose in one.outliers] for one in results]
+        eng = np.array([one.engineering[1] for one in results])
+        noise = np.array([one.s for one in results])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = np.array([(one.engineering[0][SCALE] + 1.0) for one in results])
+            gain = eng / noise[:, None]
+            gain[:, SCALE] /= size
+        parameters = np.array([engineering_quantities(one.K_a, one.D_a) * _units(one.g) for one in results])
+        return cls(
+            number=np.arange(len(results)),
+            poses=np.array([one.poses for one in results]),
+            K_a=np.array([one.K_a for one in results]),
+            D_a=np.array([one.D_a for one in results]),
+            sigma_k=np.array([one.sigma.K_a for one in results]),
+            sigma_d=np.array([one.sigma.D_a for one in results]),
+            gain=gain,
+            coverage=np.array([one.coverage_factor or np.nan for one in results]),
+            parameters=np.where(lost, np.nan, parameters),
+            dop=np.array([[one.dop.parameters[name] for name in PARAMETERS] for one in results]),
+            cost=np.array([one.cost for one in results]),
+            s=noise,
+            rms=np.array([one.rms for one in results]),
+            rms_before=np.array([one.rms_before for one in results]),
+            freedom=np.array([one.freedom for one in results]),
+            verdict=np.array([one.verdict for one in results], dtype=object),
+            reason=np.array([" ".join(one.reasons) for one in results], dtype=object),
+            warnings=_objects([one.warnings for one in results]),
+            outlying=np.array([_in_words(own) for own in named], dtype=object),
+        )
 
     def __str__(self) -> str:
         """How many sensors there are of each verdict."""
@@ -227,7 +261,7 @@ def calibrate_fleet(
             parts.append(_part(assessment, numbers[at]))
             if keep is not None:
                 for place, number in enumerate(numbers[at].tolist()):
-                    keep(number, record(assessment, place))
+                    keep(number, dated(record(assessment, place)))
     fleet = _joined(parts)
     if all(reason.startswith("--weights") for reason in fleet.reason):
         label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
@@ -284,7 +318,7 @@ def calibrate_each(
         assessment = assessed(sample, settings)
         parts.append(_part(assessment, np.array([number])))
         if keep is not None:
-            keep(number, record(assessment, 0))
+            keep(number, dated(record(assessment, 0)))
     return _joined(parts)
 
 
@@ -302,8 +336,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
     outlying = np.full(len(sample), "", dtype=object)
     for at, poses in enumerate(assessment.outliers):
         if poses:
-            more = f" and {len(poses) - NAMED} more" if len(poses) > NAMED else ""
-            outlying[at] = ", ".join(sample.where(at, pose) for pose in poses[:NAMED]) + more
+            outlying[at] = _in_words([sample.where(at, pose) for pose in poses])
     return Fleet(
         number=number,
         poses=sample.poses,
@@ -325,6 +358,12 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         warnings=_objects(assessment.warnings),
         outlying=outlying,
     )
+
+
+def _in_words(poses: Sequence[str]) -> str:
+    """Return outlying poses in words, the first few by name."""
+    more = f" and {len(poses) - NAMED} more" if len(poses) > NAMED else ""
+    return ", ".join(poses[:NAMED]) + more
 
 
 def _objects(values: Sequence[object]) -> np.ndarray:

@@ -30,6 +30,7 @@ from accelcal_cli.calibration.observability import (
     engineering_quantities,
     propagated,
 )
+from accelcal_cli.calibration.provenance import check_meta
 from accelcal_cli.calibration.settings import LARGEST
 from accelcal_cli.config import parse_mapping, read_text
 from accelcal_cli.errors import ConfigError, DataError, UsageError
@@ -248,6 +249,8 @@ class Calibration:
         version: of accelcal; schema: SCHEMA.
         temperature: slopes with temperature, when the readings determine them.
         worn: of days of wear, what GGIR says; else None.
+        meta: what the user states of it, as serial, operator, temperature; date: when it was calculated, UTC, ISO 8601.
+        g_source: where g comes from; empty in files of earlier versions.
     """
 
     K_a: Annotated[Float, array(3, 3, largest=LARGEST)]
@@ -295,6 +298,9 @@ class Calibration:
     coverage_factor: float | None = None
     shared_noise: float | None = None
     worn: Worn | None = None
+    meta: dict[str, str] = field(default_factory=dict)
+    date: str | None = None
+    g_source: str = ""
 
     @property
     def sigma_freedom(self) -> float:
@@ -495,6 +501,8 @@ class Calibration:
         place = f"{where}: not a calibration result"
         try:
             result = from_mapping(cls, record, place, extra=True)
+            if result.meta:
+                check_meta(result.meta, f"{place}: meta: ")
         except ConfigError as error:
             raise DataError(str(error)) from None
         for key, dop in (("dop", result.dop), ("geometry", result.geometry)):

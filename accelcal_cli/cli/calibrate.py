@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from accelcal_cli.cli import meta as metadata
 from accelcal_cli.cli import options, process, wear
 from accelcal_cli.errors import UsageError
 from accelcal_cli.schema import frozen
@@ -135,6 +136,7 @@ def command(
         str | None,
         options.in_output("--output", "-o", help="Result file: .yaml or .json; - is standard output."),
     ] = None,
+    meta: metadata.Meta = None,
     format: options.Format = "table",
     verbose: options.Verbose = False,
     quiet: options.Quiet = False,
@@ -151,7 +153,7 @@ def command(
     options.check_input(data)
     options.check_files([data, config], {"-o": output})
     _check_output(output, format)
-    stated_g = gravity.stated()
+    stated_g, kept = gravity.stated(), metadata.stated(meta) if meta else {}
     log.check_raw(raw)
     if worn:
         wear.check(raw, log)
@@ -171,7 +173,8 @@ def command(
             data, options.split_columns(columns), stdin=sys.stdin.buffer, options=form.read_options()
         )
     settings = replace(settings, g=own_g(readings.form.unit))
-    result = calibrate(readings, settings)
+    source = _g_source(gravity, config, readings.form.unit)
+    result = replace(calibrate(readings, settings), g_source=source, meta=kept)
     if rest is not None:
         result = replace(result, worn=rest.figures(result))
     missed = tolerance is not None and not result.rms <= tolerance
@@ -198,6 +201,14 @@ def _settings(config: Path | None, stated: dict[str, Any], raw: bool) -> Setting
         if "weights" not in keys:
             stated.setdefault("weights", weights_of_log({**keys, **stated}))
     return load_settings(config, stated)
+
+
+def _g_source(gravity: options.GravityOptions, config: Path | None, unit: str | None) -> str:
+    """Return where local gravity comes from, in words; see `local_g`."""
+    from accelcal_cli.config import load_mapping
+
+    filed = config is not None and "g" in load_mapping(config) and gravity.stated() is None
+    return f"stated in {config.name}" if filed and config is not None else gravity.source(unit)
 
 
 def local_g(

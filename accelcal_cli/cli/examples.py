@@ -60,7 +60,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "accelcal fleet fleet.csv --tolerance 0.02 -o results.csv",
         "accelcal fleet data.csv new.csv -o results/",
     ),
-    "report": ("accelcal report result.yaml -o page.html",),
+    "report": (
+        "accelcal report result.yaml -o page.html",
+        "accelcal report result.yaml --certificate --meta serial=A17 -o certificate.html",
+    ),
     "export": (
         "accelcal export result.yaml --to c-header -o calibration.h",
         "accelcal export result.yaml --to px4 --driver-scale 1670 -o imu.params",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from accelcal_cli.cli import meta as metadata
 from accelcal_cli.cli import options, process, wear
 from accelcal_cli.errors import AccelcalError, UsageError
 
@@ -123,6 +124,7 @@ def command(
             help="Table of all sensors, .csv, .parquet or .json; or a folder, ending in /, for a result file of each.",
         ),
     ] = None,
+    meta: metadata.Meta = None,
     format: options.Format = "table",
     verbose: options.Verbose = False,
     quiet: options.Quiet = False,
@@ -144,6 +146,9 @@ def command(
         options.check_input(source)
     options.check_apart([*data, config], {"-o": output})
     folder = output is not None and _check_output(output)
+    kept = metadata.stated(meta) if meta else {}
+    if kept and not folder:
+        raise UsageError("--meta is kept in result files: add -o FOLDER/")
     log.check_raw(raw)
     if worn:
         wear.check(raw, log)
@@ -171,6 +176,7 @@ def command(
         own = gravity.in_unit(unit)
         return settings.g if own is None or (stated_g is None and "g" in filed) else own
 
+    filed_g = f"stated in {config.name}" if config and stated_g is None and "g" in filed else ""
     labels: Sequence[str]
     run: Callable[[Settings, Callable[[int, Calibration], None] | None], Fleet]
     if raw:
@@ -192,7 +198,12 @@ def command(
     settings = replace(settings, g=g)
     if folder and output is not None:
         with whole_folder(output) as results:
-            fleet = run(settings, lambda number, one: write_result(results, labels[number], one))
+
+            def keep(number: int, one: Calibration) -> None:
+                source = filed_g or gravity.source(one.data.get("unit"))
+                write_result(results, labels[number], replace(one, meta=kept, g_source=source))
+
+            fleet = run(settings, keep)
     else:
         fleet = run(settings, None)
     with process.even_if_unread():

@@ -121,6 +121,14 @@ def help_text(parameter: Any, ctx: Any, text: str) -> str:
 class Command(typer.core.TyperCommand):
     """A command whose help has its options under the headings of their panels, with their choices."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the arguments, of which `--meta` takes several."""
+        if any(word.startswith("--meta") for word in args):
+            from accelcal_cli.cli.meta import spread
+
+            args = list(spread(args))
+        return super().parse_args(ctx, args)
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write a list for each panel, in the order of their first options; what has no panel comes last."""
         panels: dict[str, list[tuple[str, str]]] = {}

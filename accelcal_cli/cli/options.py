@@ -196,11 +196,21 @@ class GravityOptions:
 
     def in_unit(self, unit: str | None) -> float | None:
         """Return the stated local gravity in the unit of the readings, see `local_gravity`."""
-        if unit is None and all(value is None for value in vars(self).values()):
+        if self._nothing(unit):
             return None
         from accelcal_cli.sensor.model import local_gravity
 
         return local_gravity(unit, **vars(self))
+
+    def source(self, unit: str | None) -> str:
+        """Return where local gravity comes from, in words."""
+        from accelcal_cli.sensor.model import ASSUMED, gravity_source
+
+        return ASSUMED if self._nothing(unit) else gravity_source(unit, **vars(self))
+
+    def _nothing(self, unit: str | None) -> bool:
+        """Return whether neither the options nor the unit of the readings say what g is."""
+        return unit is None and all(value is None for value in vars(self).values())
 
     def stated(self) -> float | None:
         """Return the stated local gravity in m/s^2, or None when nothing was stated."""

@@ -239,6 +239,7 @@ def origin(result: Calibration) -> list[str]:
         f"accelcal {result.version}, verdict {result.verdict}, {result.poses} poses, g = {result.g:.9g} {result.unit}, "
         f"gauge {result.gauge}",
         f"readings {result.data.get('source', '?')}, sha256 {result.data.get('sha256', '?')}",
+        *(f"{key}: {value}" for key, value in result.meta.items()),
         *(f"{notice.severity}: {notice}" for notice in result.warnings),
     ]
     return [" ".join(line.split()) for line in lines]

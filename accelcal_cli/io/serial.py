@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from accelcal_cli.arrays import Float
-from accelcal_cli.errors import DataError, UsageError
+from accelcal_cli.errors import DataError, OutputError, UsageError
 from accelcal_cli.io.lines import LineFilter, find_filter
 from accelcal_cli.io.vocabulary import recognise
 
@@ -45,6 +46,52 @@ _BETWEEN = re.compile(r"[\s,;:=|()\[\]{}<>\"']+")
 def file_lines(file: BinaryIO) -> Iterator[bytes]:
     """Return the lines of an open file as they arrive."""
     return iter(lambda: file.readline(LONGEST), b"")
+
+
+def recorded_lines(path: str) -> Iterator[bytes]:
+    """Return the lines of a file, the recording of a capture or of any program that prints readings.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            yield from file_lines(file)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {(error.strerror or str(error)).lower()}") from None
+
+
+def in_time(readings: Iterable[Float], rate: float) -> Iterator[Float]:
+    """Yield readings as a sensor would send them, `rate` a second; none is left out where the reader is slow."""
+    start = time.monotonic()
+    for number, reading in enumerate(readings):
+        wait = start + number / rate - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        yield reading
+
+
+def copied(lines: Iterable[bytes], path: str) -> Iterator[bytes]:
+    """Yield lines and write each to a file, from which they replay; it holds those so far, whatever ends them.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with _refusal_told(path):
+        file = open(path, "wb", buffering=0)  # noqa: SIM115  # closed below
+    with file:
+        for line in lines:
+            with _refusal_told(path):
+                file.write(line.rstrip(b"\r\n") + b"\n")
+            yield line
+
+
+@contextmanager
+def _refusal_told(path: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
 
 
 def port_lines(name: str, baud: int, timeout: float) -> Iterator[bytes]:

@@ -4,29 +4,42 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from itertools import zip_longest
 from types import TracebackType
 from typing import IO
 
-from rich.console import Group
+from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from accelcal_cli.detection.capture import NEAR, Capture, CapturedPose, CaptureStatus
-from accelcal_cli.output.console import console
+from accelcal_cli.detection.capture import Capture, CapturedPose, CaptureStatus
+from accelcal_cli.output.console import VERDICT_STYLE, console
 from accelcal_cli.output.files import check_target, is_stream, open_stream, unwritten, whole_file
-from accelcal_cli.sensor.poses import describe
+from accelcal_cli.output.sphere import BOX_WIDTH, MAP_WIDTH, draw_box, draw_map
+from accelcal_cli.sensor.poses import AXES, describe
 from accelcal_cli.views.blocks import wrapped
+from accelcal_cli.views.capture import Moment, Progress, moment, progress
 
 BAR = 20
-WORDS = {
-    "moving": "moving: hold it still",
-    "still": "still",
-    "taken": "taken: go on to another pose",
-    "again": "taken already: go on to another pose",
-}
+PER_SECOND = 10
+"""How often a terminal is drawn at most."""
+
 STYLES = {"moving": "yellow", "still": "cyan", "taken": "bold green", "again": "green"}
+
+LISTED = 100
+"""Columns of a terminal that has the list of poses beside the map."""
+
+HEIGHT = 36
+"""Lines of a narrower terminal that has it below."""
+
+SENTENCES = 2
+"""Sentences on the poses that are shown, a line each; the command says all of them at its end."""
+
+NARROWEST = 3 + MAP_WIDTH + 2 + BOX_WIDTH
+"""Columns that map and box need side by side."""
 
 
 class Watch:
@@ -36,9 +49,14 @@ class Watch:
         """Watch a capture."""
         self.capture, self.quiet = capture, quiet
         self.out = console(sys.stderr)
-        self.status: CaptureStatus | None = None
+        self.scene: tuple[Moment | None, Progress] = (None, progress(capture))
+        self.drawn = -1.0
         live = not quiet and sys.stderr.isatty()
-        self.live = Live(get_renderable=self._drawn, console=self.out, refresh_per_second=8) if live else None
+        self.live = (
+            Live(get_renderable=self._drawn, console=self.out, refresh_per_second=PER_SECOND)
+            if live
+            else None
+        )
 
     def __enter__(self) -> Watch:
         """Start to show it."""
@@ -61,8 +79,12 @@ class Watch:
 
     def see(self, status: CaptureStatus) -> None:
         """Show what the sensor is doing now; a pose that was taken sounds the bell."""
-        self.status = status
-        if status.state != "taken" or self.quiet:
+        taken, now = status.state == "taken", time.monotonic()
+        if self.live and (taken or now - self.drawn >= 1.0 / PER_SECOND):
+            _, before = self.scene
+            self.scene = moment(self.capture, status), progress(self.capture) if taken else before
+            self.drawn = now
+        if not taken or self.quiet:
             return
         if self.live:
             self.out.bell()
@@ -77,33 +99,92 @@ class Watch:
         return f"pose {len(self.capture.poses)}: {name}; {pose.n} readings, sd {max(pose.spread):.3g}; {left} to take"
 
     def _drawn(self) -> Group:
-        """Return what is held now, which a low terminal must not cut off, and what has become of the poses."""
-        numbers = {index: j + 1 for j, index in enumerate(self.capture.recognised()) if index is not None}
-        near = None if self.status is None or self.status.angle > NEAR else self.status.nearest
-        lines = []
-        for index, direction in enumerate(self.capture.planned):
-            mark = f"{numbers[index]:>3} " if index in numbers else "  - "
-            pointer = "> " if index == near else "  "
-            style = "green" if index in numbers else "bold" if index == near else ""
-            lines.append(Text(f"{pointer}{mark} {describe(direction)}", style))
-        others = self.capture.recognised().count(None)
-        if others:
-            lines.append(Text(f"       and {others} not in the plan, kept"))
-        return Group(*self._now(), Text(f"{len(numbers)} of {len(self.capture.planned)} taken:"), *lines)
+        return picture(*self.scene, self.out)
 
-    def _now(self) -> list[Text]:
-        if self.status is None:
-            return [Text("waiting for readings"), Text("")]
-        now, filled = self.status, round(BAR * self.status.progress)
-        bar = "#" * filled + "." * (BAR - filled)
-        state = f"[{bar}] {WORDS[now.state]}"
-        held = f"{now.angle:.0f} degrees from {describe(self.capture.planned[now.nearest])}"
-        return [
-            Text(state, STYLES[now.state]),
-            Text(
-                f"{held}; sd {now.spread:.2g}, still below {now.limit:.2g}", overflow="ellipsis", no_wrap=True
-            ),
-        ]
+
+def picture(now: Moment | None, so_far: Progress, out: Console) -> Group:
+    """Return what a terminal shows: what is held now first, which a low terminal must not cut off.
+
+    Args:
+        now: None while the sensor has sent too little.
+        so_far: what has become of the poses; out: the terminal, whose size and encoding decide.
+    """
+    unicode = out.encoding.lower().startswith("utf")
+    listed = _list(now, so_far)
+    lines = [*_now(now, so_far, unicode), *_pictures(now, so_far, out, listed, unicode=unicode)]
+    lines += [Text(so_far.count, "bold"), *_calibration(so_far)]
+    if out.width < LISTED and out.height >= HEIGHT:
+        lines += listed
+    for line in lines:
+        line.no_wrap, line.overflow = True, "ellipsis" if unicode else "crop"
+    return Group(*lines)
+
+
+def _now(now: Moment | None, so_far: Progress, unicode: bool) -> list[Text]:
+    if now is None:
+        return [Text("waiting for readings")]
+    filled = round(BAR * now.progress)
+    full, empty = ("█", "░") if unicode else ("#", ".")
+    axes = "  ".join(f"{axis} {value:+9.4g}" for axis, value in zip(AXES, now.reading, strict=True))
+    following = "-" if now.next is None else so_far.words[now.next]
+    return [
+        Text(f"{axes}  |f| {now.length:.4f} g"),
+        Text(f"[{full * filled}{empty * (BAR - filled)}] {now.words}", STYLES[now.state]),
+        Text(f"sd    {now.spread:.2g}, still below {now.limit:.2g}"),
+        Text(f"held  {now.hold}"),
+        Text.assemble("next  ", (following, "bold cyan")),
+    ]
+
+
+def _pictures(
+    now: Moment | None, so_far: Progress, out: Console, listed: list[Text], *, unicode: bool
+) -> list[Text]:
+    """Return the map, and beside it as much as the terminal has columns for: the box of the next pose, the list."""
+    missing = [index for index, number in enumerate(so_far.numbers) if number is None]
+    following = now.next if now is not None else missing[0] if missing else None
+    direction = None if now is None else now.direction
+    lines = draw_map(so_far.planned, so_far.taken, missing, following, direction, unicode=unicode)
+    if following is not None and out.width >= NARROWEST:
+        box = [Text(line, "cyan") for line in draw_box(so_far.planned[following], unicode=unicode)]
+        lines = _beside(lines, [*box, Text(f"{'next, up is up':^{BOX_WIDTH}}")], 3 + MAP_WIDTH + 2)
+    return _beside(lines, listed, NARROWEST + 2) if out.width >= LISTED else lines
+
+
+def _beside(left: list[Text], right: list[Text], column: int) -> list[Text]:
+    """Return lines of two pictures beside each other, the right one from a column on."""
+    lines = []
+    for one, other in zip_longest(left, right):
+        line = Text() if one is None else one.copy()
+        if other is not None:
+            line.append(" " * max(column - line.cell_len, 1)).append_text(other)
+        lines.append(line)
+    return lines
+
+
+def _list(now: Moment | None, so_far: Progress) -> list[Text]:
+    """Return the planned poses, a line each: the number of the captured pose, or none, and how to hold it."""
+    lines = []
+    for index, (words, number) in enumerate(zip(so_far.words, so_far.numbers, strict=True)):
+        held = now is not None and now.held == index
+        style = "green" if number is not None else "bold" if held else ""
+        mark = "-" if number is None else f"{number}"
+        lines.append(Text(f"{'>' if held else ' '} {mark:>3}  {words}", style))
+    return lines
+
+
+def _calibration(so_far: Progress) -> list[Text]:
+    """Return the calibration of the poses so far, or what it waits for."""
+    found, said = so_far.summary, [Text(sentence) for sentence in so_far.sentences[:SENTENCES]]
+    if found is None:
+        return [Text(f"calibration: {so_far.outlook}"), *said]
+    bias = "  ".join(f"{axis} {value}" for axis, (value, _) in zip(AXES, found.bias, strict=True))
+    dop = "  ".join(f"{kind} {size}" for kind, size in found.dop)
+    return [
+        Text.assemble("calibration: ", (found.verdict, VERDICT_STYLE.get(found.verdict, "bold"))),
+        Text(f"bias  {bias}   s {found.noise}"),
+        Text(f"DOP   {dop}"),
+        *said,
+    ]
 
 
 HEADER = "pose,n,Nx,Ny,Nz,sx,sy,sz\n"
@@ -142,7 +223,7 @@ class PoseFile:
         """
         if len(taken) == self.kept:
             return
-        rows = [_row(number, pose) for number, pose in enumerate(taken, 1)]
+        rows = pose_rows(taken)
         if self._stream is None:
             with whole_file(self.path) as file:
                 file.writelines([HEADER, *rows])
@@ -183,7 +264,10 @@ class PoseFile:
             raise unwritten(self.path, error) from None
 
 
-def _row(number: int, pose: CapturedPose) -> str:
-    """Return the row of a pose, with the shortest digits that read back to the same numbers."""
-    cells = [repr(float(v)) for v in (*pose.mean, *pose.spread)]
-    return ",".join([str(number), str(pose.n), *cells]) + "\n"
+def pose_rows(taken: Sequence[CapturedPose]) -> list[str]:
+    """Return the rows of poses, with the shortest digits that read back to the same numbers."""
+    cells = [[repr(float(v)) for v in (*pose.mean, *pose.spread)] for pose in taken]
+    return [
+        ",".join([str(number), str(pose.n), *row]) + "\n"
+        for number, (pose, row) in enumerate(zip(taken, cells, strict=True), 1)
+    ]

@@ -303,3 +303,31 @@ def local_gravity(
         return metres
     size = OUTPUT_OF_1_G[unit]
     return size if metres is None else metres * size / STANDARD_GRAVITY
+
+
+ASSUMED = "standard gravity, assumed: no local value was stated"
+"""Where local gravity comes from when nothing says it."""
+
+
+def gravity_source(
+    unit: str | None = None,
+    *,
+    g: float | None = None,
+    latitude: float | None = None,
+    height: float | None = None,
+) -> str:
+    """Return in words where local gravity comes from; arguments as of `local_gravity`.
+
+    Examples:
+        >>> gravity_source(latitude=48.1, height=500)
+        'WGS84 normal gravity at latitude 48.1 degrees, height 500 m'
+        >>> gravity_source()
+        'standard gravity, assumed: no local value was stated'
+    """
+    if latitude is not None:
+        return f"WGS84 normal gravity at latitude {latitude:g} degrees, height {height or 0.0:g} m"
+    if g is not None:
+        return "stated by the user"
+    if unit in ("g", "mg"):
+        return "the readings' own unit: 1 g is taken as the local gravity"
+    return ASSUMED

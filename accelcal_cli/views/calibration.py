@@ -31,6 +31,9 @@ KINDS = (
 KEYS = ("scale_factor_error", "misalignment", "bias")
 """Names of the kinds in CSV."""
 
+VERDICTS = ("good", "weak", "suspect", "undetermined")
+"""Of a calibration, the best first."""
+
 WORST_SHOWN = 5
 INTERVAL = "+- 95 %"
 """Heading of the half-widths of 95 % intervals."""

@@ -32,6 +32,9 @@ RMS_BEFORE, RMS_AFTER = "rms of |f| - g before", "rms of |f| - g after"
 WORST_DOP = "worst dilution of precision"
 """Names of the quantities that are shown beside the nine parameters and `NOISE`."""
 
+SHORT = ("scale ", "misal. ", "bias ")
+"""Kinds of parameters where there is little room."""
+
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 VERDICTS = ("good", "weak", "suspect", "undetermined", FAILED)
 
@@ -127,18 +130,58 @@ def _formats(g: float) -> dict[str, tuple[str, str]]:
     }
 
 
-def _spread(fleet: Fleet, g: float) -> Table:
-    """Return quantiles of parameters, fit and dilution of precision over the sensors with a verdict to use."""
-    quantities = {
+def quantities(fleet: Fleet, g: float) -> dict[str, tuple[str, Float]]:
+    """Return unit and values of each quantity, shape (R,), NaN for the sensors that their poses do not determine."""
+    values = {
         **dict(zip(PARAMETERS, fleet.parameters.T, strict=True)),
         RMS_BEFORE: fleet.rms_before,
         RMS_AFTER: fleet.rms,
         NOISE: fleet.s,
         WORST_DOP: fleet.dop.max(axis=1),
     }
-    rows = []
-    for name, (unit, spec) in _formats(g).items():
-        values = quantities[name][fleet.determined]
+    return {
+        name: (unit, np.where(fleet.determined, values[name], np.nan))
+        for name, (unit, _) in _formats(g).items()
+    }
+
+
+def tables(fleet: Fleet, labels: Sequence[str], standouts: Sequence[Standout], g: float) -> list[Table]:
+    """Return the tables of a fleet that `blocks` shows with `verbose`."""
+    return [block for block in blocks(fleet, labels, standouts, g, verbose=True) if isinstance(block, Table)]
+
+
+def listing(fleet: Fleet, labels: Sequence[str], g: float) -> Table:
+    """Return one row per sensor for people: verdict, poses, fit, parameters."""
+    formats = _formats(g)
+    columns = (
+        Column("sensor"),
+        Column("verdict"),
+        Column("poses", format="d"),
+        Column("rms after", formats[RMS_AFTER][0], ".3g"),
+        Column("s", formats[NOISE][0], ".3g"),
+        *(Column(SHORT[p // 3] + name.split()[-1], *formats[name]) for p, name in enumerate(PARAMETERS)),
+    )
+    shown = np.where(fleet.determined[:, None], fleet.parameters, np.nan)
+    rows = tuple(
+        (label, verdict, poses, rms, s, *numbers)
+        for label, verdict, poses, rms, s, numbers in zip(
+            labels,
+            fleet.verdict.tolist(),
+            fleet.poses.tolist(),
+            fleet.rms.tolist(),
+            fleet.s.tolist(),
+            shown.tolist(),
+            strict=True,
+        )
+    )
+    return Table("Sensors", columns, rows)
+
+
+def _spread(fleet: Fleet, g: float) -> Table:
+    """Return quantiles of parameters, fit and dilution of precision over the sensors with a verdict to use."""
+    formats, rows = _formats(g), []
+    for name, (unit, values) in quantities(fleet, g).items():
+        spec = formats[name][1]
         values = values[np.isfinite(values)]
         if len(values):
             row = np.quantile(values, QUANTILES).tolist()

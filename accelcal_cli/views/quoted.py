@@ -209,7 +209,8 @@ def screen(result: Calibration, *further: Table) -> list[Block]:
     conclusion = Conclusion(result.verdict, result.reasons, result.warnings)
     last = Paragraph(f": {summary(result)}. All poses, search, observability: --verbose", result.verdict)
     tables = [parameters(result), engineering(result), fit(result), *further]
-    return [conclusion, BLANK, *tables, *notes(result.notes), last]
+    kept = [Paragraph(f": {value}", key) for key, value in result.meta.items()]
+    return [conclusion, BLANK, *tables, *kept, *notes(result.notes), last]
 
 
 def _said(result: Calibration) -> list[str]:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import sys
+import time
+
 import numpy as np
 import pytest
 
@@ -231,3 +235,143 @@ def test_lines_without_numbers_are_refused(run, tmp_path):
     assert done.code == 2
     assert 'lines in a row without 3 numbers, as "hello world"' in done.err
     assert list(tmp_path.iterdir()) == []
+
+
+# Recordings
+
+
+def test_a_recording_replays_in_its_time(run, tmp_path):
+    """The poses are those that standard input gives, and each reading takes its time."""
+    (tmp_path / "session.txt").write_bytes(b"# a comment takes none\n" * 50 + stream(3))
+    quick = ("--rate", "200", "--window", "0.1", "--hold", "0.2")
+    assert run("capture", "--port", "-", *quick, "-o", "piped.csv", stdin=stream(3)).code == 1
+    before = time.monotonic()
+    done = run("capture", "--port", "session.txt", *quick, "-o", "replayed.csv")
+    assert done.code == 1
+    assert time.monotonic() - before >= (3 * 60 - 1) / 200
+    assert "accelcal: 3 poses in replayed.csv" in done.err
+    assert (tmp_path / "replayed.csv").read_bytes() == (tmp_path / "piped.csv").read_bytes()
+
+
+def test_what_is_recorded_replays(run, tmp_path):
+    options = ("--rate", "2000", "--window", "0.01", "--hold", "0.02")
+    first = run(
+        "capture", "--port", "-", *options, "--record", "session.txt", "-o", "1.csv", stdin=stream(12)
+    )
+    assert first.code == 0
+    assert stream(12).startswith((tmp_path / "session.txt").read_bytes())
+    again = run("capture", "--port", "session.txt", *options, "-o", "2.csv")
+    assert again.code == 0
+    assert again.err.replace("2.csv", "1.csv") == first.err
+    assert (tmp_path / "2.csv").read_bytes() == (tmp_path / "1.csv").read_bytes()
+
+
+def test_a_recording_is_kept_when_the_input_ends_early(run, tmp_path):
+    assert run("capture", *FAST, "--record", "session.txt", "-o", "1.csv", stdin=stream(5)).code == 1
+    assert (tmp_path / "session.txt").read_bytes() == stream(5)
+
+
+def test_a_full_disk_ends_a_recording_and_keeps_the_poses(run, tmp_path):
+    done = run("capture", *FAST, "--record", "/dev/full", "-o", "poses.csv", stdin=stream(12))
+    assert done.code == 2
+    assert done.err.startswith("12 poses to take")
+    assert "accelcal: /dev/full: cannot be written: no space left on device; " in done.err
+    assert "Traceback" not in done.err
+
+
+# The calibration in the end
+
+
+def test_the_result_is_what_calibrate_makes_of_the_poses(run, tmp_path):
+    done = run("capture", *FAST, "-o", "poses.csv", "--result", "result.yaml", "--g", "1", stdin=stream(12))
+    assert done.code == 0
+    assert done.err.splitlines()[-1] == (
+        "accelcal: 12 poses in poses.csv; their calibration is good, in result.yaml"
+    )
+    assert run("calibrate", "poses.csv", "--g", "1", "-o", "other.yaml").code == 0
+    assert (tmp_path / "result.yaml").read_text() == (tmp_path / "other.yaml").read_text()
+
+
+@pytest.mark.parametrize("unit", ["g", "mg"])
+def test_the_unit_of_the_sensor_decides_what_gravity_is(run, tmp_path, unit):
+    lines = stream(12).decode().splitlines()
+    size = 1.0 if unit == "g" else 1000.0
+    data = "".join(" ".join(f"{size * float(v):.6f}" for v in line.split()) + "\n" for line in lines).encode()
+    done = run("capture", *FAST, "-o", "poses.csv", "--unit", unit, "--result", "result.json", stdin=data)
+    assert done.code == 0
+    record = json.loads((tmp_path / "result.json").read_text())
+    assert (record["g"], record["data"]["unit"]) == (size, unit)
+
+
+def test_too_few_poses_are_calibrated_as_undetermined(run, tmp_path):
+    done = run("capture", *FAST, "-o", "poses.csv", "--result", "result.yaml", stdin=stream(5))
+    assert done.code == 1
+    assert "their calibration is undetermined, in result.yaml" in done.err
+
+
+def test_one_pose_is_not_calibrated(run, tmp_path):
+    done = run("capture", *FAST, "-o", "poses.csv", "--result", "result.yaml", stdin=stream(1))
+    assert done.code == 1
+    assert done.err.splitlines()[-1] == (
+        "accelcal: 1 pose in poses.csv, 11 planned are missing; they allow no calibration, result.yaml is not written"
+    )
+    assert not (tmp_path / "result.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--bind", "0.0.0.0"), "--bind needs --web"),
+        (("--web-port", "8000"), "--web-port needs --web"),
+        (("--web", "--bind", "example.org"), '--bind "example.org": expected an address of this machine'),
+        (("--web", "--bind", "192.0.2.1"), "--bind 192.0.2.1 --web-port 0: cannot be used: "),
+        (
+            ("--result", "result.csv"),
+            '--result "result.csv": expected a name that ends in .yaml or .yml or .json',
+        ),
+        (("--record", "-"), '--record "-": expected the name of a file'),
+        (
+            ("--record", "there.txt"),
+            '--record "there.txt": exists already; expected a new name, or --overwrite',
+        ),
+        (("--record", "./new.txt", "-o", "new.txt"), 'new.txt": is stated twice; expected a name of its own'),
+        (("--record", "no/new.txt"), "no/new.txt: no such folder: no"),
+        (("--g", "9.8", "--latitude", "48"), "--g and --latitude: expected one of them, not both"),
+    ],
+)
+def test_what_is_stated_wrongly_is_told_before_the_first_reading(run, tmp_path, options, said):
+    (tmp_path / "there.txt").write_text("an earlier session\n")
+    done = run("capture", *FAST, *options, stdin=stream(1))
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
+    assert done.err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["there.txt"]
+
+
+def test_the_recording_that_is_replayed_is_not_replaced(run, tmp_path):
+    (tmp_path / "session.txt").write_bytes(stream(1))
+    done = run("capture", "--port", "session.txt", "--record", "session.txt", "--overwrite")
+    assert (done.code, done.err) == (
+        2,
+        'accelcal: --record "session.txt": is the input itself; expected another name\n',
+    )
+
+
+def test_without_a_page_nothing_of_its_server_is_imported(shell, tmp_path):
+    (tmp_path / "log").write_bytes(stream(12))
+    told = shell(
+        f"{sys.executable} -X importtime -m accelcal_cli capture {' '.join(FAST)} -o p.csv < log"
+    ).err
+    loaded = {
+        line.rpartition("|")[2].strip() for line in told.splitlines() if line.startswith("import time:")
+    }
+    assert "accelcal_cli.output.live" in loaded
+    assert not loaded & {
+        "asyncio",
+        "http.client",
+        "segno",
+        "accelcal_cli.output.server",
+        "accelcal_cli.output.page",
+        "accelcal_cli.calibration.calibrate",
+        "serial",
+    }
