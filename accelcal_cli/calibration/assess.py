@@ -13,7 +13,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float
 from accelcal_cli.calibration.distributions import chi_square_chance
-from accelcal_cli.calibration.fit import NOTABLE_BIAS, Fit, edge_names
+from accelcal_cli.calibration.fit import NOTABLE_BIAS, Fit
 from accelcal_cli.calibration.observability import (
     ALIGNED,
     FEWEST_POSES,
@@ -25,7 +25,7 @@ from accelcal_cli.calibration.observability import (
 from accelcal_cli.calibration.residuals import OUTLIER_LEVEL
 from accelcal_cli.calibration.result import Verdict
 from accelcal_cli.calibration.sample import NO_NOISE, axis_up
-from accelcal_cli.calibration.search import rounding
+from accelcal_cli.calibration.search import edge_names, rounding
 from accelcal_cli.notices import Notice, Severity, are_serious
 from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.model import OUTPUT_OF_1_G, STANDARD_GRAVITY
@@ -116,18 +116,10 @@ class Assessment:
 
 def assess(fit: Fit) -> Assessment:
     """Assess a fit."""
-    walled: list[bool] = np.asarray(fit.at_wall.any(axis=1)).tolist()
-    unchecked = _unchecked(fit)
-    geometry = [
-        _geometry(verdict, wall, freedom, poor)
-        for verdict, wall, freedom, poor in zip(
-            fit.geometry.observability.verdicts,
-            walled,
-            fit.freedom.tolist(),
-            np.asarray(unchecked.any(axis=1)).tolist(),
-            strict=True,
-        )
-    ]
+    walled, unchecked = np.asarray(fit.at_wall.any(axis=1)), _unchecked(fit)
+    poor, geometry = np.asarray(unchecked.any(axis=1)), list(fit.geometry.observability.verdicts)
+    for at in np.flatnonzero(walled | poor | (fit.freedom == 0)).tolist():
+        geometry[at] = _geometry(geometry[at], bool(walled[at]), int(fit.freedom[at]), bool(poor[at]))
     reasons: list[tuple[str, ...]] = [()] * len(geometry)
     suggestions = list(reasons)
     for at, word in enumerate(geometry):
@@ -135,13 +127,14 @@ def assess(fit: Fit) -> Assessment:
             suggestions[at], reasons[at] = _advice(fit, at, unchecked[at])
     outliers = _outliers(fit)
     warnings: list[tuple[Notice, ...]] = [()] * len(geometry)
+    verdicts: list[Verdict] = list(geometry)
     left, (bent, drift) = _to_gain(fit), fit.patterns
     limit = np.where(_are_more_than_noise(fit), LIKELY_PATTERN, SURELY_PATTERN)
     patterned = (bent < limit) | (drift < limit)
     for at in np.flatnonzero(_may_have_warnings(fit, left) | patterned).tolist():
         own = _patterns_in_words(float(bent[at]), float(drift[at]), float(limit[at]))
         warnings[at] = (*_warnings(fit, at, float(left[at]), outliers[at]), *own)
-    verdicts = [_verdict(word, said) for word, said in zip(geometry, warnings, strict=True)]
+        verdicts[at] = _verdict(geometry[at], warnings[at])
     return Assessment(fit, verdicts, reasons, suggestions, warnings, outliers)
 
 
@@ -202,7 +195,11 @@ def _advice(fit: Fit, at: int, unchecked: Bool) -> tuple[tuple[str, ...], tuple[
     suggestions: tuple[str, ...] = ()
     if not known and view.verdict != "good":
         suggestions = poses_to_add(fit.geometry.information[at], attitudes, aligned=aligned)
-    lines = list(view.in_words("The known attitudes" if known else "The poses", suggestions))
+    lines = (
+        []
+        if view.verdict == "good"
+        else list(view.in_words("The known attitudes" if known else "The poses", suggestions))
+    )
     if not known and attitudes < poses and view.verdict != "good":
         lines.insert(0, f"The {poses:,} poses have {attitudes} different attitudes, and those decide.")
     if unchecked.any():
@@ -295,12 +292,11 @@ def _fewest_attitudes(fit: Fit) -> int:
 
 def _warnings(fit: Fit, at: int, left: float, outliers: tuple[int, ...]) -> tuple[Notice, ...]:
     """Return what is said of a sensor, the gravest first."""
-    readings, settings = fit.sample.readings(at), fit.settings
-    s, freedom = float(fit.s[at]), int(fit.freedom[at])
-    where = [readings.where(pose) for pose in outliers]
+    settings, s, freedom = fit.settings, float(fit.s[at]), int(fit.freedom[at])
+    where = [fit.sample.where(at, pose) for pose in outliers]
     loss: Loss = "known" if fit.solution is None else "plain" if settings.robust == "none" else "robust"
     lines = [
-        *readings.warnings,
+        *fit.sample.warnings(at),
         *_few_attitudes(fit, at),
         *not_fitting(where, freedom, loss),
         *large_residuals(s, settings.g, freedom, aligned=not settings.misalignment),
@@ -570,11 +566,10 @@ def _against_labels(fit: Fit, at: int) -> tuple[Notice, ...]:
     """Return a note of axes that the fit has the other way round than most labels that say which way is up."""
     if fit.view[at].verdict == "undetermined":
         return ()
-    readings, residuals = fit.sample.readings(at), fit.residuals
-    real = residuals.real[at]
+    residuals, real = fit.residuals, fit.residuals.real[at]
     votes = np.zeros((3, 2), dtype=int)  # of each axis: labels that the fit bears out, and others
     for pose, force in zip(residuals.pose[at, real].tolist(), residuals.force[at, real], strict=True):
-        said = axis_up(readings.where(pose))
+        said = axis_up(fit.sample.where(at, pose))
         if said is not None:
             axis, up = said
             part = up * float(force[axis]) / fit.settings.g

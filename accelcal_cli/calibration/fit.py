@@ -51,7 +51,7 @@ from accelcal_cli.calibration.search import SLOPES, Search, Solution, state, uns
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.schema import frozen
-from accelcal_cli.sensor.model import ErrorModel, Gauge, misalignment, to_gauge
+from accelcal_cli.sensor.model import ErrorModel, Gauge, inverse, misalignment, to_gauge
 
 EDGE = 1e-6
 """A parameter within this part of a half-width from the wall of its box is at the edge."""
@@ -142,7 +142,7 @@ class Fit:
     @cached_property
     def K_A(self) -> Float:  # noqa: N802
         """Inverse matrices, m/s^2 per output unit, shape (R, 3, 3)."""
-        return np.linalg.inv(self.K)
+        return inverse(self.K)
 
     @cached_property
     def patterns(self) -> tuple[Float, Float]:
@@ -192,6 +192,7 @@ class _Point:
     Attributes:
         K, D: shapes (R, 3, 3) and (R, 3); lower: K in gauge `lower`.
         information: J^T J less what slopes take of it, shape (R, 9, 9); observability: of it.
+        ones: J^T 1, shape (R, 9): the last column of the triangle is of ones, compressed.
         freedom: degrees of freedom of the residuals, shape (R,).
         bias: what may remain of the noise bias, m/s^2, shape (R, 9).
     """
@@ -200,6 +201,7 @@ class _Point:
     D: Float
     lower: Float
     information: Float
+    ones: Float
     observability: Observability
     freedom: Int
     bias: Float
@@ -297,12 +299,14 @@ def _point(solution: Solution, held: Bool | None) -> _Point:
     K, D = solution.cost.parameters(solution.x)
     nine, x = solution.plain.in_lower(K, D)
     slopes = solution.slopes
-    information = nine.information(x) - (0.0 if slopes is None else slopes.loss)
+    J = nine.design(x)
+    information = J.swapaxes(1, 2) @ J - (0.0 if slopes is None else slopes.loss)
+    ones = (J.swapaxes(1, 2) @ solution.plain.triangle.R[:, :, 10:])[..., 0]
     observability = Observability.of(information, sample.poses, held)
     unknowns = min(9, solution.cost.unknowns) + SLOPES * (slopes is not None)
     counted = solution.sample.counted(solution.stated.rejected)
     lower, bias = nine.parameters(x)[0], np.zeros((len(sample), 9))
-    return _Point(K, D, lower, information, observability, counted - unknowns, bias)
+    return _Point(K, D, lower, information, ones, observability, counted - unknowns, bias)
 
 
 def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
@@ -313,10 +317,7 @@ def _unbiased(solution: Solution, point: _Point, g: float) -> _Point:
     cofactor, noise = point.observability.cofactor, solution.stated.noise
     room = np.where(point.freedom > 0, point.freedom, np.nan)
     variance = solution.value / (4.0 * g * g) / room if solution.noise is None else solution.noise**2
-    nine, x = solution.plain.in_lower(point.K, point.D)
-    R = solution.plain.triangle.R
-    ones = (nine.design(x).swapaxes(1, 2) @ R[:, :, 10:])[..., 0]  # the last column is of ones, compressed
-    bias = -isotropic_bias(ones, variance, cofactor, g)
+    bias = -isotropic_bias(point.ones, variance, cofactor, g)
     unalike = UNALIKE * np.sqrt(variance * solution.sample.poses) / g
     if noise is not None and noise.known.any():
         u = directions(solution.sample, point.lower, point.D)
@@ -403,11 +404,13 @@ def _geometry(
     """
     sample, slopes = solution.sample, solution.slopes
     poses = int(sample.poses.max())
+    u: Float = np.zeros((0, 0, 3))
     if poses <= KEPT:
         real = sample.real(0, poses)
         if solution.stated.rejected is not None:
             real = real & ~solution.stated.rejected
-        attitudes, once = distinct(directions(sample, *sight), real, sample.labelled)
+        u = directions(sample, *sight)
+        attitudes, one = distinct(u, real, sample.labelled)
     else:
         cells = [CellCount() for _ in range(len(sample))]
         for first, _, f in sample.errors(*sight, solution.stated.settings.g):
@@ -418,13 +421,16 @@ def _geometry(
         counted = [cell.distinct() for cell in cells]
         attitudes, once = np.array([n for n, _ in counted]), np.stack([rows for _, rows in counted])
         attitudes = np.where(sample.labelled, sample.poses, attitudes)
-    if slopes is not None:
-        once = lessened(once, information + slopes.loss, slopes.loss)
     alike = attitudes == sample.poses
     if solution.stated.settings.weights != "none" or solution.stated.rejected is not None:
         alike = np.zeros_like(alike)
     if alike.all() and int(attitudes.max()) <= STANDARD:
         return Geometry(attitudes, view, information)
+    if poses <= KEPT:
+        rows = design(u) * one[..., None]
+        once = rows.swapaxes(1, 2) @ rows
+    if slopes is not None:
+        once = lessened(once, information + slopes.loss, slopes.loss)
     return Geometry.of(np.where(alike[:, None, None], information, once), attitudes, held)
 
 
@@ -469,12 +475,6 @@ def _at_wall(x: Float) -> Bool:
     return edge
 
 
-def edge_names(at_wall: Bool) -> tuple[str, ...]:
-    """Return the names of the unknowns that are at a wall of the box, of those marked in shape (D,)."""
-    matrix = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: len(at_wall) - 3]
-    return tuple(n for n, at in zip((*matrix, "D_1", "D_2", "D_3"), at_wall, strict=True) if at)
-
-
 def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:
     """Return s^2, (m/s^2)^2, shape (R,): sum w e^2 over the degrees of freedom, NaN without any; `sums` as of `_pass`.
 
@@ -506,13 +506,15 @@ def uncalibrated(scale: Float, D: Float, settings: Settings) -> tuple[Float, Flo
         k, bias = (np.broadcast_to(v, D.shape) for v in (settings.nominal.scale, settings.nominal.bias))
         return k, bias, ["the stated nominal sensor"] * len(D)
     # A nominal scale factor carries no more than three significant digits.
-    rounded = np.array([float(f"{value:.3g}") for value in scale.tolist()])
+    power = 10.0 ** np.maximum(np.floor(np.log10(scale)) - 2.0, 0.0)
+    shift = 10.0 ** np.maximum(2.0 - np.floor(np.log10(scale)), 0.0)
+    rounded = np.round(scale / power * shift) / shift * power
     force = (rounded > 0.8) & (rounded < 1.25)  # specific force already, in m/s^2 or in g
     words = "one scale factor for all axes and the estimated bias, no misalignment"
     return (
         np.repeat(np.where(force, 1.0, rounded)[:, None], 3, axis=1),
         np.where(force[:, None], 0.0, D),
-        ["the readings as they are" if f else words for f in force],
+        ["the readings as they are" if f else words for f in force.tolist()],
     )
 
 

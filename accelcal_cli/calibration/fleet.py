@@ -6,7 +6,7 @@ determine the ellipsoid, the start is the least cost itself, and the solver conf
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -204,17 +204,14 @@ def fleet(
 
 
 def check_settings(settings: Settings, *, each: bool = False) -> None:
-    """Refuse what is not done for a fleet, or where `each` sensor is calibrated by itself (`calibrate_each`).
+    """Refuse what is not done for a fleet; `each` sensor by itself, of a log (`calibrate_each`), has no attitudes.
 
     Raises:
-        ConfigError: known attitudes, gauge `full`, several runs; a robust loss or weights "auto" for all at once.
+        ConfigError: another optimizer, gauge `full`, several runs.
     """
     for key, allowed in {
         "optimizer": ("levenberg-marquardt",),
-        "robust": ("none", "huber", "soft-l1") if each else ("none",),
-        "weights": ("none", "n", "sd", *(("auto",) if each else ())),
-        "attitudes": ("unknown",),
-        "misalignment": (True,),
+        "attitudes": ("unknown",) if each else ("unknown", "known"),
         "gauge": ("lower", "upper", "symmetric"),
         "runs": (1,),
         "polish": (True,),
@@ -252,17 +249,46 @@ def calibrate_fleet(
             bad = np.array([bool(word) for word in words])
             parts.append(_failed(numbers[bad], sample.poses[bad], [word for word in words if word]))
             sample, numbers = sample.take(np.flatnonzero(~bad)), numbers[~bad]
-        if len(numbers):
-            assessment = assessed(sample, settings, closed=True)
-            parts.append(_part(assessment, numbers))
+        if not settings.temperature:
+            sample = replace(sample, temperature=None)
+        for own, at in _together(sample, settings):
+            try:
+                assessment = assessed(own, settings, closed=_is_closed(settings))
+            except DataError as error:  # of known attitudes, which are one sensor's
+                why = str(error).removeprefix(f"{own.readings(0).source}: ")
+                parts.append(_failed(numbers[at], own.poses, [why]))
+                continue
+            parts.append(_part(assessment, numbers[at]))
             if keep is not None:
-                for at, number in enumerate(numbers.tolist()):
-                    keep(number, dated(record(assessment, at)))
+                for place, number in enumerate(numbers[at].tolist()):
+                    keep(number, dated(record(assessment, place)))
     fleet = _joined(parts)
     if all(reason.startswith("--weights") for reason in fleet.reason):
         label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
         raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
     return fleet
+
+
+def _is_closed(settings: Settings) -> bool:
+    """Whether the least cost is that of the closed form: six unknowns are not those of an ellipsoid, which has nine.
+
+    And the rounds of a robust loss go on from where the search of one sensor ends, to the last digit.
+    """
+    return settings.misalignment and settings.robust == "none"
+
+
+def _together(sample: Sample, settings: Settings) -> Iterator[tuple[Sample, slice]]:
+    """Yield the sensors that go through the flow together, and their places in the sample.
+
+    A robust loss, weights by an error that poses share, and slopes have rounds of their own for every sensor.
+    """
+    alone = settings.robust != "none" or settings.weights == "auto" or settings.attitudes == "known"
+    if not alone and sample.temperature is None:
+        if len(sample):
+            yield sample, slice(None)
+        return
+    for at in range(len(sample)):
+        yield sample.alone(at), slice(at, at + 1)
 
 
 def calibrate_each(
@@ -307,14 +333,10 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
     """Return the part of a fleet that an assessment tells of."""
     fit, sample, settings = assessment.fit, assessment.fit.sample, assessment.fit.settings
 
-    def texts(lines: list[tuple[str, ...]]) -> np.ndarray:
-        return np.array([" ".join(own) for own in lines], dtype=object)
-
     outlying = np.full(len(sample), "", dtype=object)
     for at, poses in enumerate(assessment.outliers):
         if poses:
-            readings = sample.readings(at)
-            outlying[at] = _in_words([readings.where(pose) for pose in poses])
+            outlying[at] = _in_words([sample.where(at, pose) for pose in poses])
     return Fleet(
         number=number,
         poses=sample.poses,
@@ -332,7 +354,7 @@ def _part(assessment: Assessment, number: Int) -> Fleet:
         rms_before=fit.rms_before,
         freedom=np.broadcast_to(fit.freedom, sample.poses.shape),
         verdict=np.array(assessment.verdicts, dtype=object),
-        reason=texts(assessment.reasons),
+        reason=np.array([" ".join(own) for own in assessment.reasons], dtype=object),
         warnings=_objects(assessment.warnings),
         outlying=outlying,
     )
@@ -346,10 +368,7 @@ def _in_words(poses: Sequence[str]) -> str:
 
 def _objects(values: Sequence[object]) -> np.ndarray:
     """Return values, tuples too, as an array of one dimension."""
-    array = np.empty(len(values), dtype=object)
-    for at, value in enumerate(values):
-        array[at] = value
-    return array
+    return np.fromiter(values, dtype=object, count=len(values))
 
 
 def _failed(number: Int, poses: Int, words: list[str]) -> Fleet:

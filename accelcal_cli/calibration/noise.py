@@ -144,8 +144,7 @@ def _crossed(sample: Sample) -> Bool:
 
 def directions(sample: Sample, K: Float, D: Float) -> Float:
     """Return the unit directions of the specific force, shape (R, J, 3), by sensors K and D."""
-    f = (sample.output() - D[:, None]) @ np.linalg.inv(K).swapaxes(1, 2)
-    return unit(f)
+    return unit(np.concatenate([f for _, _, f in sample.errors(K, D, 1.0)], axis=1))
 
 
 def _prior(ratio: Float, own: Float) -> tuple[Float, Float]:

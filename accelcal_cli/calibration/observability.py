@@ -27,7 +27,15 @@ from numpy.typing import NDArray
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.schema import frozen
-from accelcal_cli.sensor.model import AXIS_PAIRS, ErrorModel, bias_force, misalignment, sensitivity
+from accelcal_cli.sensor.model import (
+    AXIS_PAIRS,
+    ErrorModel,
+    bias_force,
+    inverse,
+    inverse_normal,
+    misalignment,
+    sensitivity,
+)
 from accelcal_cli.sensor.poses import describe, faces, fixture_directions
 
 ROWS_COLUMNS = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1), (0, 1), (0, 2), (1, 2))
@@ -54,6 +62,12 @@ RANK_TOLERANCE = 1e-12
 """An eigenvalue of the information below this part of the largest is zero: double precision's square root of
 it, 1e-6, is the smallest relative difference between poses that an ordinary CSV file can carry."""
 
+WELL_CONDITIONED = 1e5
+"""Trace of the information times that of its inverse below which the inverse needs no eigenvalues."""
+
+RIDGE = 1e-14
+"""Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
+
 ALIGNED = np.repeat([False, True, False], 3)
 """The parameters that are not estimated when the axes are taken as perpendicular."""
 
@@ -65,6 +79,13 @@ def design(u: Float) -> Float:
     """Return d e / d parameters, shape (..., J, 9), for unit directions u of the specific force, shape (..., J, 3)."""
     pairs = [u[..., i] * u[..., j] for i, j in ROWS_COLUMNS[:6]]
     return np.stack([*(-p for p in pairs), u[..., 0], u[..., 1], u[..., 2]], axis=-1)
+
+
+def near_inverse(normal: Float) -> Float:
+    """Return the inverses of normal matrices, shape (..., p, p): without meaning where they are singular."""
+    one = np.eye(normal.shape[-1])
+    ridge = RIDGE * np.einsum("...pp->...", normal)[..., None, None] * one
+    return inverse_normal((normal + ridge).reshape(-1, *one.shape)).reshape(normal.shape)
 
 
 def verdict_of(worst: float, rank: int, parameters: int = 9) -> PoseVerdict:
@@ -96,7 +117,8 @@ class Observability:
     Attributes:
         cofactor: (J^T J)^-1, its pseudo-inverse when the rank is below p, shape (..., p, p) for p parameters.
         dop: dilution of precision of each parameter, shape (..., p); inf where the poses do not determine it.
-        bounded: the same under the prior, at most 1000, shape (..., p): it names what is not determined.
+        bounded: the same under the prior, at most 1000, shape (..., p): it names what is not determined. Of good poses,
+            of which there is nothing to name, it is dop.
         rank: number of determined directions, at most p, shape (...).
         names: of the p parameters.
     """
@@ -115,6 +137,24 @@ class Observability:
         """
         if held is not None and held.any():
             return cls._of_free(information, poses, np.flatnonzero(~held))
+        cofactor = near_inverse(information)
+        size, variance = np.einsum("...pp->...", information), np.einsum("...pp->...p", cofactor)
+        with np.errstate(all="ignore"):
+            dop = np.sqrt(variance)
+            good = (variance.min(axis=-1) > 0) & (variance.max(axis=-1) <= WEAK**2)
+            good &= size * variance.sum(axis=-1) < WELL_CONDITIONED
+        rank = np.minimum(np.full(good.shape, dop.shape[-1]), poses)
+        if good.all():
+            return cls(cofactor, dop, dop, rank)
+        poor = cls._of_eigenvalues(information[~good], np.broadcast_to(poses, good.shape)[~good])
+        bounded, rank = dop.copy(), np.array(rank)
+        cofactor[~good], dop[~good], bounded[~good] = poor.cofactor, poor.dop, poor.bounded
+        rank[~good] = poor.rank
+        return cls(cofactor, dop, bounded, rank)
+
+    @classmethod
+    def _of_eigenvalues(cls, information: Float, poses: Int) -> Observability:
+        """Return the observability of matrices that may be singular, shape (R, p, p)."""
         values, vectors = np.linalg.eigh(information)
         known = values > RANK_TOLERANCE * values[..., -1:]
         inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
@@ -165,10 +205,10 @@ class Observability:
     @cached_property
     def verdicts(self) -> list[PoseVerdict]:
         """The verdict on each of R sets of poses."""
-        return [
-            verdict_of(worst, rank, len(self.names))
-            for worst, rank in zip(self.worst.tolist(), self.rank.tolist(), strict=True)
-        ]
+        words: list[PoseVerdict] = ["good"] * len(self.dop)
+        for at in np.flatnonzero(~((self.worst <= WEAK) & (self.rank == len(self.names)))).tolist():
+            words[at] = verdict_of(float(self.worst[at]), int(self.rank[at]), len(self.names))
+        return words
 
     def in_words(self, whose: str, suggestions: Sequence[str]) -> tuple[str, ...]:
         """Return what is not determined, what is weak, and what to add, in sentences. One set of poses."""
@@ -228,8 +268,8 @@ class Geometry:
         return cls(attitudes, Observability.of(information / excess, attitudes, held), information)
 
 
-def distinct(u: Float, real: Bool, labelled: Bool) -> tuple[Int, Float]:
-    """Return how many attitudes poses have, shape (R,), and J^T J of one direction of each, shape (R, 9, 9).
+def distinct(u: Float, real: Bool, labelled: Bool) -> tuple[Int, Bool]:
+    """Return how many attitudes poses have, shape (R,), and which poses are one of each, shape (R, J).
 
     The direction with the most neighbours within `APART` degrees takes them all, until none is left.
 
@@ -237,16 +277,14 @@ def distinct(u: Float, real: Bool, labelled: Bool) -> tuple[Int, Float]:
         u: unit directions of the specific force, shape (R, J, 3), J at most some thousand; real: which poses count.
         labelled: sensors whose poses are attitudes of their own, shape (R,).
     """
-    rows = design(u) * real[..., None]
-    information = rows.swapaxes(1, 2) @ rows
-    count = real.sum(axis=1)
+    count, one = real.sum(axis=1), real
     near = (u @ u.swapaxes(1, 2) >= NEAR) & real[:, :, None] & real[:, None]
     for sensor in np.flatnonzero((near.sum(axis=(1, 2)) > count) & ~labelled).tolist():
-        middles = _greedy(near[sensor], real[sensor])
-        count[sensor] = len(middles)
-        own = rows[sensor, middles]
-        information[sensor] = own.T @ own
-    return count, information
+        one = one.copy() if one is real else one
+        one[sensor] = False
+        one[sensor, _greedy(near[sensor], real[sensor])] = True
+        count[sensor] = one[sensor].sum()
+    return count, one
 
 
 def _greedy(near: Bool, real: Bool) -> list[int]:
@@ -338,7 +376,7 @@ def moved_sensor(K: Float, D: Float, step: Float, g: float) -> tuple[Float, Floa
     E = np.zeros_like(K)
     for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
         E[:, i, j] = step[:, p] / g
-    return K @ np.linalg.inv(np.eye(3) + E), D + np.einsum("rii->ri", K) * step[:, BIAS]
+    return K @ inverse(np.eye(3) + E), D + np.einsum("rii->ri", K) * step[:, BIAS]
 
 
 def unit(force: Float) -> Float:
@@ -481,22 +519,19 @@ def engineering_chain(lower: Float, D: Float, g: float) -> Float:
         g: local gravity, m/s^2: the first six parameters are g times the entries of E.
     """
     s = sensitivity(lower)
-    rows = lower / s[..., None]
+    rows, (a, b), (i, j) = lower / s[..., None], np.transpose(ROWS_COLUMNS[:6]), np.transpose(AXIS_PAIRS)
+    first, second = rows.take(a, axis=-1), rows.take(b, axis=-1)
+    scale = -first * second / g
+    cosine = np.sum(rows.take(i, axis=-2) * rows.take(j, axis=-2), axis=-1)[..., None]
+    turn = first.take(i, axis=-2) * second.take(j, axis=-2) + second.take(i, axis=-2) * first.take(j, axis=-2)
+    turn = -turn / g - cosine * (scale.take(i, axis=-2) + scale.take(j, axis=-2))
     change = np.zeros((*lower.shape[:-2], 9, 9))
-    for p, (a, b) in enumerate(ROWS_COLUMNS[:6]):
-        scale = -rows[..., a] * rows[..., b] / g
-        change[..., :3, p] = scale
-        for q, (i, j) in enumerate(AXIS_PAIRS):
-            cosine = np.sum(rows[..., i, :] * rows[..., j, :], axis=-1)
-            turn = -(rows[..., i, a] * rows[..., j, b] + rows[..., i, b] * rows[..., j, a]) / g
-            turn -= cosine * (scale[..., i] + scale[..., j])
-            with np.errstate(
-                divide="ignore", invalid="ignore"
-            ):  # two axes that are one have no angle to turn
-                change[..., 3 + q, p] = turn / np.sqrt(1.0 - cosine**2)
-        change[..., 6:, p] = -D / s * scale
-    for i in range(3):
-        change[..., 6 + i, 6 + i] = lower[..., i, i] / s[..., i]
+    change[..., :3, :6] = scale
+    with np.errstate(divide="ignore", invalid="ignore"):  # two axes that are one have no angle to turn
+        change[..., 3:6, :6] = turn / np.sqrt(1.0 - cosine**2)
+    change[..., 6:, :6] = -(D / s)[..., None] * scale
+    for k in range(3):
+        change[..., 6 + k, 6 + k] = lower[..., k, k] / s[..., k]
     return change
 
 
@@ -508,7 +543,9 @@ def propagated(chain: Float, covariance: Float) -> Float:
         covariance: NaN in the row of a parameter without one, which leaves none to the quantities that it moves.
     """
     lost = np.isnan(np.einsum("...pp->...p", covariance))
-    square = np.einsum("...ip,...pq,...iq->...i", chain, np.nan_to_num(covariance), chain)
+    if not lost.any():
+        return np.asarray(np.sqrt(np.maximum(np.sum((chain @ covariance) * chain, axis=-1), 0.0)))
+    square = np.sum((chain @ np.nan_to_num(covariance)) * chain, axis=-1)
     size = np.abs(chain)
     moved = size > NEGLIGIBLE * size.max(axis=(-1, -2), keepdims=True)
     touched = (moved & lost[..., None, :]).any(axis=-1)
@@ -526,6 +563,11 @@ def gauge_chain(K: Float, K_lower: Float, gauge: str, g: float) -> Float:
     small rotation W (skew) is the one that keeps K in its gauge: three linear conditions. In `full`, which has none,
     W leaves the body frame unturned.
     """
+    if gauge == "lower":  # K E is of this gauge, nothing turns
+        chain = np.zeros((*K.shape[:-2], 3, 3, 6))
+        for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
+            chain[..., j, p] = -K[..., i] / g
+        return chain.reshape(*K.shape[:-2], 9, 6)
     R = np.linalg.solve(K, K_lower)
     turned = [K @ _skew(axis) for axis in np.eye(3)]
     turns = np.stack([_conditions(change, gauge) for change in turned], axis=-1)

@@ -15,17 +15,17 @@ bias, A's Cholesky factor the matrix.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 
-from accelcal_cli.arrays import Float, Int
+from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.observability import ROWS_COLUMNS
 from accelcal_cli.calibration.sample import Sample
 from accelcal_cli.optimization.problem import Problem
 from accelcal_cli.schema import frozen
-from accelcal_cli.sensor.model import to_gauge
+from accelcal_cli.sensor.model import inverse, inverse_triangles, to_gauge
 
 PAIRS = (np.array([0, 1, 2, 0, 0, 1, 0, 1, 2, 3]), np.array([0, 1, 2, 1, 2, 2, 3, 3, 3, 3]))
 """Which entries of the symmetric 4 x 4 matrix Q the vector q holds."""
@@ -117,21 +117,22 @@ class Loetters(Problem):
     def jacobian(self, x: Float) -> Float:
         """Return d residual / d u in (m/s^2)^2, shape (R, P, 11, D).
 
-        From dA = -A dK A and dM = [dA | -dA d - A dd], column by column.
+        From dA = -A dK A and dM = [dA | -dA d - A dd]: with W = A^T M, d |M h|^2 is -2 (W_i h) (M_j h) by K_ij, and
+        -2 W_i h by d_i.
         """
-        K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
-        A = _inverse(K)
-        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)  # dM for dK_ij is -A e_i (row j of M)
-        columns = []
-        for i, j in ROWS_COLUMNS[: self.unknowns - 3]:
-            columns.append(_quadratic_change(M, -A[..., :, i, None] * M[..., j, None, :]))
-        for i in range(3):
-            change = np.zeros_like(M)
-            change[..., 3] = -A[..., :, i]
-            columns.append(_quadratic_change(M, change))
-        q = np.stack(columns, axis=-1) * self._half[:, None, None]
+        A, M = self._matrices(x)
+        rows, columns = zip(*ROWS_COLUMNS[: self.unknowns - 3], strict=True)
+        H = M.swapaxes(-1, -2)
+        q = _products((H @ A).take((*rows, 0, 1, 2), axis=-1), H, columns)
+        q *= -self._half[:, None, None]
         jacobian: Float = self._R[:, None] @ q
         return jacobian
+
+    def _matrices(self, x: Float) -> tuple[Float, Float]:
+        """Return A and M = [A | -A d], shapes (R, P, 3, 3) and (R, P, 3, 4), at x, shape (R, P, D)."""
+        K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
+        A = inverse(K)
+        return A, np.concatenate([A, -(A @ d[..., None])], axis=-1)
 
     @property
     def groups(self) -> Int:
@@ -146,9 +147,7 @@ class Loetters(Problem):
         2 <A W Y, A W> + 4 <M Y, A dK A W> as a quadratic form.
         """
         J, r = self.jacobian(x), self.residuals(x)
-        K, d = unpack(self._centre[:, None] + self._half[:, None] * x)
-        A = _inverse(K)
-        M = np.concatenate([A, -(A @ d[..., None])], axis=-1)
+        A, M = self._matrices(x)
         Y = _symmetric((self._R.swapaxes(1, 2)[:, None] @ r[..., None])[..., 0])
         dK = np.zeros((self.unknowns, 3, 3))
         dd = np.zeros((self.unknowns, 3, 4))
@@ -209,18 +208,15 @@ class Loetters(Problem):
     def design(self, x: Float) -> Float:
         """Return d (-e) / d (the nine parameters of `observability`), shape (R, 11, 9), at x, shape (R, 9).
 
-        Of the compressed residuals. The chain runs over K_a = K_a0 (I + E)^-1, so dK_a = -K_a0 E, and dD_i = K_ii times
-        the bias as force.
+        Of the compressed residuals. K_a = K_a0 (I + E)^-1 makes d (-e) = (M_i h) (M_j h) by g E_ij, and dD_i = K_ii
+        times the bias as force -K_ii W_i h, in units of g as in `jacobian`.
         """
-        K, _ = self.parameters(x)
-        chain = np.zeros((len(K), 9, 9))
-        for p, (i, j) in enumerate(ROWS_COLUMNS[:6]):
-            change = np.zeros_like(K)
-            change[:, :, j] = -K[:, :, i] / self.g
-            chain[:, :, p] = pack(change, np.zeros((len(K), 3)), 9)
-        for i in range(3):
-            chain[:, 6 + i, 6 + i] = K[:, i, i]
-        design: Float = self.jacobian(x[:, None])[:, 0] / self.units[:, None, :] @ chain / (2.0 * self.g)
+        A, M = self._matrices(x[:, None])
+        A, H = A[:, 0], M[:, 0].swapaxes(1, 2)
+        W = H @ A / (-2.0 * np.einsum("rii->ri", A)[:, None])  # of a triangle, 1 / A_ii is K_ii
+        rows, columns = zip(*ROWS_COLUMNS[:6], strict=True)
+        q = _products(np.concatenate([0.5 * H.take(rows, axis=-1), W], axis=-1), H, columns)
+        design: Float = self.triangle.R[..., :10] @ q
         return design
 
     def information(self, x: Float) -> Float:
@@ -246,19 +242,18 @@ class Loetters(Problem):
         return q
 
 
-def _inverse(K: Float) -> Float:
-    """Return K^-1, shape (..., 3, 3); NaN where K is singular, so that one run's fate is not that of the batch."""
-    with suppress(np.linalg.LinAlgError):
-        return np.linalg.inv(K)
-    regular = (np.linalg.det(K) != 0)[..., None, None]
-    return np.where(regular, np.linalg.inv(np.where(regular, K, np.eye(3))), np.nan)
+def _products(left: Float, right: Float, columns: Sequence[int]) -> Float:
+    """Return twice the forms (left_p h) (right_q h), q of `columns`, then (left_p h) 1, p running, with h = (x, 1).
 
-
-def _quadratic_change(M: Float, dM: Float) -> Float:
-    """Return d vech(M^T M), shape (R, P, 10), for a change dM of M, both (R, P, 3, 4)."""
-    change = dM.swapaxes(-1, -2) @ M
+    As coefficients of Q, shape (..., 10, n), for columns of shape (..., 4, n) and (..., 4, 3).
+    """
+    other = np.zeros(left.shape)
+    other[..., : len(columns)] = right.take(columns, axis=-1)
+    other[..., 3, len(columns) :] = 1.0
     first, second = PAIRS
-    return change[..., first, second] + change[..., second, first]
+    products: Float = left.take(first, axis=-2) * other.take(second, axis=-2)
+    products += left.take(second, axis=-2) * other.take(first, axis=-2)
+    return products
 
 
 def _symmetric(y: Float) -> Float:
@@ -312,9 +307,41 @@ class Triangle:
     scale: Float
     poses: Int
 
+    @cached_property
+    def nearest(self) -> Nearest:
+        """The quadrics that the closed forms start from."""
+        return Nearest.of(self.R)
+
     def take(self, index: Int) -> Triangle:
         """Return the triangles of the sensors at `index`."""
         return Triangle(self.R[index], self.centre[index], self.scale[index], self.poses[index])
+
+
+@frozen(eq=False)
+class Nearest:
+    """The quadrics x^T A x + 2 m^T x = 1 of R sensors with the least algebraic residual.
+
+    Of a triangle T, t and rho are the first nine columns, the tenth above its diagonal, and its diagonal there.
+
+    Attributes:
+        inverse: T^-1, shape (R, 9, 9); y: T^-1 t, (A_11 A_22 A_33 A_12 A_13 A_23 m), shape (R, 9); rho: shape (R,).
+        solvable: whether the readings determine y, shape (R,); else all of this is without meaning.
+    """
+
+    inverse: Float
+    y: Float
+    rho: Float
+    solvable: Bool
+
+    @classmethod
+    def of(cls, R: Float) -> Nearest:
+        """Return the quadrics of triangles, shape (R, 11, 11)."""
+        T = R[:, :9, :9]
+        pivots = np.abs(np.einsum("rii->ri", T))
+        solvable = np.asarray(pivots.min(axis=1) > SMALLEST_PIVOT * pivots.max(axis=1))
+        lower = np.where(solvable[:, None, None], T, np.eye(9)).transpose(2, 1, 0)
+        inverse = np.ascontiguousarray(inverse_triangles(lower).transpose(2, 1, 0))
+        return cls(inverse, _times(inverse, R[:, :9, 9]), R[:, 9, 9], solvable)
 
 
 def quadric_rows(x: Float) -> Float:
@@ -345,12 +372,16 @@ def compress(
             they keep the arithmetic free of cancellation.
         poses: J of each sensor, shape (R,).
     """
-    R: Float = np.zeros((len(scale), 11, 11))
+    R: Float | None = None
     for block, weight in blocks:
         table = quadric_rows((block - centre[:, None]) / scale[:, None, None])
         if weight is not None:
             table *= np.sqrt(weight)[..., None]
-        R = _triangle(np.concatenate([R, _pieces(table)], axis=1))
+        if R is None and table.shape[1] < 11:
+            R = np.zeros((len(scale), 11, 11))
+        table = _pieces(table)
+        R = _triangle(table if R is None else np.concatenate([R, table], axis=1))
+    assert R is not None
     return Triangle(R, centre, scale, poses)
 
 
@@ -370,12 +401,7 @@ def compress_each(readings: Float, weights: Float | None = None) -> Triangle:
     """Compress the readings of R sensors, shape (R, J, 3), with weights, shape (R, J), or None, all at once."""
     low, high = readings.min(axis=1), readings.max(axis=1)
     centre, scale = 0.5 * (low + high), 0.5 * (high - low).max(axis=1)
-    table = quadric_rows((readings - centre[:, None]) / scale[:, None, None])
-    if weights is not None:
-        table *= np.sqrt(weights)[..., None]
-    if table.shape[1] < 11:
-        table = np.concatenate([table, np.zeros((len(table), 11 - table.shape[1], 11))], axis=1)
-    return Triangle(_triangle(table), centre, scale, np.full(len(readings), readings.shape[1]))
+    return compress([(readings, weights)], centre, scale, np.full(len(readings), readings.shape[1]))
 
 
 def _pieces(table: Float) -> Float:
@@ -425,7 +451,7 @@ def fit_ellipsoid(triangle: Triangle) -> tuple[Float, Float]:
     quadric, or noise that makes the fitted quadric no ellipsoid. Where the axes of the ellipsoid differ too much to be
     those of a sensor, it is fitted anew with every axis brought to unit extent.
     """
-    K, centre, _ = _ellipsoid(triangle.R[..., :10])
+    K, centre = _ellipsoid(triangle.nearest)
     refused = np.flatnonzero(np.isnan(K[:, 0, 0]))
     if len(refused):
         K[refused], centre[refused] = _of_unit_extent(triangle.take(refused))
@@ -443,13 +469,14 @@ def _of_unit_extent(triangle: Triangle) -> tuple[Float, Float]:
     usable &= np.linalg.eigvalsh(np.where(usable[:, None, None], correlation, 0.0))[:, 0] > LEAST_SPREAD
     factor = quadric_rows(1.0 / extent[:, None])[:, 0, :9]
     factor[:, 3:] *= 0.5  # the rows hold 2 x_i x_j and 2 x_i
-    phi = np.concatenate([triangle.R[..., :9] * factor[:, None], triangle.R[..., 9:10]], axis=2)
-    K, centre, uncertain = _ellipsoid(phi, triangle.poses)
+    R = triangle.R.copy()
+    R[..., :9] *= factor[:, None]
+    nearest = Nearest.of(R)
+    K, centre = _ellipsoid(nearest)
     size = np.sqrt(np.sum(K**2, axis=2))
     with np.errstate(invalid="ignore"):
-        usable &= (
-            (size.max(axis=1) < FILLED) & (size.min(axis=1) > 1.0 / FILLED) & (uncertain < SURELY_FILLED)
-        )
+        usable &= (size.max(axis=1) < FILLED) & (size.min(axis=1) > 1.0 / FILLED)
+        usable &= _uncertain(nearest, triangle.poses) < SURELY_FILLED
     return (
         np.where(usable[:, None, None], K * extent[:, :, None], np.nan),
         np.where(usable[:, None], centre * extent, np.nan),
@@ -465,47 +492,40 @@ def _moments(triangle: Triangle) -> Float:
     return np.asarray(_matrix(sums) - mean[:, :, None] * mean[:, None, :])
 
 
-def _ellipsoid(phi: Float, poses: Int | None = None) -> tuple[Float, Float, Float]:
-    """Return K in gauge `lower`, centre, and how uncertain the diagonal of A is, as a part of it, shape (R,).
+def _traced(nearest: Nearest) -> tuple[Float, Float]:
+    """Return the quadrics y of least F / trace(A)^2, shape (R, 9), and T^-1 T^-T times the gradient of the trace.
 
-    Args:
-        phi: the first ten columns of triangles, shape (R, 11, 10).
-        poses: J, shape (R,); without it nothing is uncertain.
+    That is the least algebraic residual with trace(A) = 3: y = T^-1 (t + rho^2 / trace(A_t) T^-T (1 1 1 0 ...)), A_t of
+    the quadric nearest to t.
     """
-    # trace(A) = 3 eliminates A_33 = 3 - A_11 - A_22.
-    left = np.concatenate([phi[..., :2] - phi[..., 2:3], phi[..., 3:]], axis=-1)
-    right = -3.0 * phi[..., 2]
-    q, r = np.linalg.qr(left)
-    pivots = np.abs(np.einsum("...ii->...i", r))
-    solvable = pivots.min(axis=-1) > SMALLEST_PIVOT * pivots.max(axis=-1)
-    r = np.where(solvable[:, None, None], r, np.eye(9))
-    z = np.linalg.solve(r, q.swapaxes(-1, -2) @ right[..., None])[..., 0]
-    A = np.empty((len(z), 3, 3))
-    A[:, 0, 0], A[:, 1, 1], A[:, 2, 2] = z[:, 0], z[:, 1], 3.0 - z[:, 0] - z[:, 1]
-    A[:, 0, 1] = A[:, 1, 0] = z[:, 2]
-    A[:, 0, 2] = A[:, 2, 0] = z[:, 3]
-    A[:, 1, 2] = A[:, 2, 1] = z[:, 4]
-    m, d = z[:, 5:8], z[:, 8]
-    values = np.linalg.eigvalsh(A)
-    solvable &= (values[:, 0] > 0) & (values[:, 2] < LARGEST_CONDITION**2 * values[:, 0])
-    A = np.where(solvable[:, None, None], A, np.eye(3))
-    centre = -np.linalg.solve(A, m[..., None])[..., 0]
-    level = -np.einsum("ri,ri->r", m, centre) - d  # c^T A c - d
-    solvable &= level > 0
-    shape = np.linalg.inv(A) * np.where(solvable, level, 1.0)[:, None, None]
-    K = np.linalg.cholesky(0.5 * (shape + shape.swapaxes(-1, -2)))
-    uncertain = np.zeros(len(z))
-    if poses is not None:
-        square = np.sum((right - _times(left, z)) ** 2, axis=1) / np.maximum(poses - 9, 1)
-        inverse = np.linalg.inv(r)[:, :2]
-        inverse = np.concatenate([inverse, inverse.sum(axis=1, keepdims=True)], axis=1)
-        own = np.sqrt(square[:, None] * np.sum(inverse**2, axis=2))
-        uncertain = np.max(own / np.einsum("rii->ri", A), axis=1)
-    return (
-        np.where(solvable[:, None, None], K, np.nan),
-        np.where(solvable[:, None], centre, np.nan),
-        uncertain,
-    )
+    gradient = _times(nearest.inverse, np.sum(nearest.inverse[:, :3], axis=1))
+    trace = np.sum(nearest.y[:, :3], axis=1)
+    return nearest.y + (nearest.rho**2 / trace)[:, None] * gradient, gradient
+
+
+def _ellipsoid(nearest: Nearest) -> tuple[Float, Float]:
+    """Return K in gauge `lower`, shape (R, 3, 3), and centres, shape (R, 3), by `_traced`; NaN for no ellipsoid."""
+    with np.errstate(all="ignore"):
+        y, _ = _traced(nearest)
+        K, centre, condition = _sensors(y, nearest.solvable)
+        refused = np.flatnonzero(~(condition < LARGEST_CONDITION**2))  # a bound: most need no eigenvalues
+        values = np.linalg.eigvalsh(np.nan_to_num(_matrix(y[refused]), posinf=0.0, neginf=0.0))
+        refused = refused[~((values[:, 0] > 0) & (values[:, 2] < LARGEST_CONDITION**2 * values[:, 0]))]
+    K[refused], centre[refused] = np.nan, np.nan
+    return K, centre
+
+
+def _uncertain(nearest: Nearest, poses: Int) -> Float:
+    """Return how uncertain the diagonal of A is, as a part of it, shape (R,)."""
+    with np.errstate(all="ignore"):
+        y, gradient = _traced(nearest)
+        part = (nearest.rho / nearest.y[:, :3].sum(axis=1)) ** 2 * gradient[:, :3].sum(axis=1)
+        square = nearest.rho**2 * (1.0 + part)
+        # Of y over its trace: what T^-1 does to the errors of the rows, less what the trace takes of it.
+        errors, share = nearest.inverse[:, :3], y[:, :3] / y[:, :3].sum(axis=1, keepdims=True)
+        errors = errors - share[..., None] * errors.sum(axis=1, keepdims=True)
+        own = np.sqrt((square / np.maximum(poses - 9, 1))[:, None] * np.sum(errors**2, axis=2))
+        return np.asarray(np.max(own / np.abs(y[:, :3]), axis=1))
 
 
 def least_squares(triangle: Triangle) -> tuple[Float, Float]:
@@ -521,27 +541,21 @@ def least_squares(triangle: Triangle) -> tuple[Float, Float]:
     phi(d) the row of a reading at the centre d. F is the noise squared, so each round gains as many digits. NaN for
     a sensor whose readings determine no ellipsoid; after much noise the rounds end before the last digits.
     """
-    T, t, rho = triangle.R[:, :9, :9], triangle.R[:, :9, 9], triangle.R[:, 9, 9]
-    pivots = np.abs(np.einsum("rii->ri", T))
-    solvable = pivots.min(axis=1) > SMALLEST_PIVOT * pivots.max(axis=1)
-    inverse = np.linalg.inv(np.where(solvable[:, None, None], T, np.eye(9)))
-    first = _times(inverse, t)
-    y = first
+    nearest = triangle.nearest
+    inverse, y = nearest.inverse, nearest.y
+    F = nearest.rho**2
     with np.errstate(all="ignore"):
         for _ in range(ROUNDS):
             d, e = _centre(y)
-            F = rho**2 + np.sum(_times(T, y - first) ** 2, axis=1)
-            back = _times(inverse.swapaxes(1, 2), quadric_rows(d[:, None])[:, 0, :9])
-            y = first - (F / (1.0 + e))[:, None] * _times(inverse, back)
-        d, e = _centre(y)
-        A = _matrix(y) / (1.0 + e)[:, None, None]
-        values = np.linalg.eigvalsh(np.where(np.isfinite(A), A, 0.0))
-        solvable &= (
-            np.isfinite(A).all(axis=(1, 2)) & np.isfinite(d).all(axis=1) & (values[:, 0] > SMALLEST_PIVOT)
-        )
-    shape = np.linalg.inv(np.where(solvable[:, None, None], A, np.eye(3)))
-    K = np.linalg.cholesky(0.5 * (shape + shape.swapaxes(1, 2)))
-    return np.where(solvable[:, None, None], K, np.nan), np.where(solvable[:, None], d, np.nan)
+            back = (
+                _times(inverse.swapaxes(1, 2), quadric_rows(d[:, None])[:, 0, :9]) * (F / (1.0 + e))[:, None]
+            )
+            # T y - t is -back: the next F.
+            y, F = nearest.y - _times(inverse, back), nearest.rho**2 + np.sum(back * back, axis=1)
+        K, d, condition = _sensors(y, nearest.solvable)
+    lost = ~(condition < 1.0 / SMALLEST_PIVOT)
+    K[lost], d[lost] = np.nan, np.nan
+    return K, d
 
 
 def _times(matrix: Float, vector: Float) -> Float:
@@ -551,12 +565,34 @@ def _times(matrix: Float, vector: Float) -> Float:
 
 def _matrix(y: Float) -> Float:
     """Return A, shape (R, 3, 3), of the quadrics y, shape (R, 9)."""
-    return y[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+    return y.take([0, 3, 4, 3, 1, 5, 4, 5, 2], axis=1).reshape(-1, 3, 3)
 
 
 def _centre(y: Float) -> tuple[Float, Float]:
-    """Return d = -A^-1 m, shape (R, 3), and m^T A^-1 m, shape (R,), by cofactors: a singular A gives inf or NaN."""
-    A, m = _matrix(y), y[:, 6:]
-    cofactors = np.stack([np.cross(A[:, k - 2], A[:, k - 1]) for k in range(3)], axis=2)
-    d: Float = -_times(cofactors, m) / np.sum(A[:, 0] * cofactors[..., 0], axis=1)[:, None]
-    return d, -np.sum(m * d, axis=1)
+    """Return d = -A^-1 m, shape (R, 3), and m^T A^-1 m, shape (R,): a singular A gives inf or NaN."""
+    d: Float = -_times(inverse(_matrix(y)), y[:, 6:])
+    return d, -np.sum(y[:, 6:] * d, axis=1)
+
+
+def _sensors(y: Float, solvable: Bool) -> tuple[Float, Float, Float]:
+    """Return K in gauge `lower`, shape (R, 3, 3), and centres, shape (R, 3), of quadrics; NaN for those without.
+
+    And a bound on the condition of A, trace(A) trace(A^-1), shape (R,).
+    """
+    A = _matrix(y)
+    d, e = _centre(y)
+    shape = inverse(A)
+    condition = np.einsum("rii->r", A) * np.einsum("rii->r", shape)
+    K = _root(shape * (1.0 + e)[:, None, None])
+    sound = solvable & np.isfinite(d).all(axis=1) & np.isfinite(K).all(axis=(1, 2))
+    K[~sound], d[~sound], condition[~sound] = np.nan, np.nan, np.nan
+    return K, d, condition
+
+
+def _root(S: Float) -> Float:
+    """Return the Cholesky factors of symmetric matrices, shape (R, 3, 3); NaN where they are not positive definite."""
+    L = np.zeros(S.shape)
+    for j in range(3):
+        column = S[:, j:, j] - np.sum(L[:, j:, :j] * L[:, j : j + 1, :j], axis=2)
+        L[:, j:, j] = column / np.sqrt(column[:, :1])
+    return L

@@ -6,7 +6,7 @@ import numpy as np
 
 from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.distributions import f_chance, student_chance
-from accelcal_cli.calibration.observability import ROWS_COLUMNS, design, unit
+from accelcal_cli.calibration.observability import RIDGE, ROWS_COLUMNS, design, near_inverse, unit
 from accelcal_cli.calibration.sample import NO_NOISE, Sample, length_error
 from accelcal_cli.schema import frozen
 
@@ -15,14 +15,15 @@ KEPT = 1000
 
 KEPT_WORST = 20
 
-SUSPECT = 3.0
-"""Studentised residuals beyond this may be outliers: those of Student's t with any freedom are as large at least."""
-
-BENT = 0.01
-"""A residual beyond this part of g bends the fit so far that no first-order formula holds."""
-
 OUTLIER_LEVEL = 0.002
 """Chance of naming an outlier among all poses where there is none (Bonferroni over the poses)."""
+
+SUSPECT, SUSPECT_LEVEL = 3.0, 100.0 * OUTLIER_LEVEL
+"""Studentised residuals beyond the first may be outliers: those of Student's t with any freedom are as large at least.
+And so large by a chance below the second: of 12 poses, which leave two degrees of freedom, beyond 7.7."""
+
+BENT = 0.002
+"""A residual beyond this part of g bends the fit so far that no first-order formula holds."""
 
 STEPS, SETTLED = 12, 1e-6
 """Gauss-Newton steps at most of a fit without a pose, and the part of g below which a step is the last: the next would
@@ -33,9 +34,6 @@ OPEN_DIRECTION = 1e-8
 
 LEAST_ROOM = 1e-8
 """The trace of a matrix times that of its inverse is below 1 over this where the other poses determine a sensor."""
-
-RIDGE = 1e-14
-"""Part of the trace that is added to the diagonal, so that no matrix of a batch is singular to the last bit."""
 
 
 @frozen(eq=False)
@@ -96,7 +94,8 @@ def pose_residuals(
     room = room_of(leverage)
     error, studentised = size - g, studentise(scaled, room, total[:, None], free)
     left_out = error / room
-    sensor, pose = np.nonzero(is_suspect(studentised, error, free, g) & real & (w > 0))
+    may_be = is_suspect(studentised, error, sample.poses[:, None], free, g)
+    sensor, pose = np.nonzero(may_be & real & (w > 0))
     if number.shape[1] < int(
         sample.poses.max()
     ):  # of so many poses none bends the fit, unless beyond all measure
@@ -140,15 +139,17 @@ def _tell_rejected(
     studentised[out], left_out[out] = (error / deviation)[out], error[out]
 
 
-def is_suspect(studentised: Float, error: Float, freedom: Int | int, g: float) -> Bool:
-    """Return which poses may be outliers, or bend the fit too far for the first-order formula, shape (..., J).
+def is_suspect(studentised: Float, error: Float, poses: Int, freedom: Int, g: float) -> Bool:
+    """Return which poses may be outliers, or bend the fit too far for the first-order formula, shape (R, J).
 
     Args:
         studentised: by that formula, NaN where it has nothing to say; error: |f| - g, m/s^2.
-        freedom: J - 9, a scalar or of shape (..., 1).
+        poses: J, shape (R, 1); freedom: J - 9, shape (R, 1).
     """
-    large = ~(np.abs(studentised) <= SUSPECT) & (np.abs(error) > NO_NOISE * g)
-    return np.asarray((large | (np.abs(error) > BENT * g)) & (np.asarray(freedom) >= 2))
+    size = np.abs(studentised)
+    large = np.isnan(size) | beyond_chance(size, poses, freedom, SUSPECT_LEVEL)
+    large &= np.abs(error) > NO_NOISE * g
+    return np.asarray((large | (np.abs(error) > BENT * g)) & (freedom >= 2))
 
 
 def leverages(rows: Float, w: Float, cofactor: Float) -> Float:
@@ -178,16 +179,17 @@ def studentise(scaled: Float, room: Float, total: Float | float, freedom: Int | 
     return np.asarray(-scaled / deviation)
 
 
-def beyond_chance(size: Float, poses: Int, freedom: Int) -> Bool:
+def beyond_chance(size: Float, poses: Int, freedom: Int, level: float = OUTLIER_LEVEL) -> Bool:
     """Return which studentised residuals are so large that none of a sensor's would be by chance (Student's t).
 
     Args:
         size: absolute values, shape (..., J), NaN for none; poses, freedom: of their sensor, broadcast to that shape.
+        level: chance of one such residual among all poses.
     """
     beyond: Bool = np.zeros(size.shape, dtype=bool)
     suspect = np.nonzero((size > SUSPECT) & (freedom >= 2))
     poses, freedom = (np.broadcast_to(a, size.shape)[suspect] for a in (poses, freedom))
-    beyond[suspect] = poses * student_chance(size[suspect], freedom - 1) < OUTLIER_LEVEL
+    beyond[suspect] = poses * student_chance(size[suspect], freedom - 1) < level
     return beyond
 
 
@@ -311,9 +313,8 @@ def _linearised(force: Float, weights: Float, g: float, free: Int) -> tuple[Floa
 
 def _cofactor(normal: Float) -> Float:
     """Return the inverses of normal matrices, shape (S, p, p), NaN where they are singular."""
-    size, one = np.einsum("spp->s", normal), np.eye(normal.shape[1])
-    finite = np.isfinite(size)[:, None, None]
-    inverse = np.linalg.inv(np.where(finite, normal + RIDGE * size[:, None, None] * one, one))
+    size = np.einsum("spp->s", normal)
+    inverse = near_inverse(np.where(np.isfinite(size)[:, None, None], normal, np.eye(normal.shape[1])))
     spread = np.einsum("spp->s", inverse) * size
     known = (spread > 0) & (spread < 1.0 / LEAST_ROOM)
     return np.where(known[:, None, None], inverse, np.nan)

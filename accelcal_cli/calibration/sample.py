@@ -13,6 +13,7 @@ from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.settings import Robust, Settings, Weights
 from accelcal_cli.io.readings import Readings
 from accelcal_cli.io.screening import LOOKED_AT
+from accelcal_cli.notices import Notice
 from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.poses import AXES
 
@@ -85,7 +86,8 @@ class Sample:
         doubtful: whether `readings` has warnings, or might have, shape (R,).
         labelled: whether a label makes each pose an attitude of its own, shape (R,).
         in_time: whether poses follow each other in time, so that neighbours may share errors, shape (R,).
-        readings: of each sensor by its number, from 0: origin, names of the poses, notes and warnings of the reader.
+        readings: of each sensor by its number, from 0: origin, notes and warnings of the reader.
+        where: how to name a pose, by the number of its sensor and its own: by its label or its line.
         count: raw readings behind each pose, shape (R, J); scatter: standard deviation of one of them, shape
             (R, J, 3), output units; cross: covariances xy, xz, yz of one, shape (R, J, 3), output units squared; NaN
             where not known, None where nothing tells.
@@ -100,6 +102,7 @@ class Sample:
     labelled: Bool
     in_time: Bool
     readings: Callable[[int], Readings]
+    where: Callable[[int, int], str]
     count: Float | None = None
     scatter: Float | None = None
     cross: Float | None = None
@@ -136,6 +139,7 @@ class Sample:
             labelled=np.array([one.labels is not None for one in readings]),
             in_time=np.array([one.in_time for one in readings]),
             readings=readings.__getitem__,
+            where=lambda at, pose: readings[at].where(pose),
             count=stack("count"),
             scatter=stack("scatter"),
             cross=stack("cross"),
@@ -157,19 +161,22 @@ class Sample:
             doubtful=doubtful,
             labelled=fleet.labelled(batch),
             in_time=np.zeros_like(doubtful),
-            readings=lambda at: fleet.one(batch, at),
+            readings=lambda at: fleet.one(batch, at, screened=bool(doubtful[at])),
+            where=lambda at, pose: fleet.where(int(batch.pose[at, pose])),
             count=batch.behind,
             scatter=batch.scatter,
             cross=batch.cross,
+            reference=batch.reference,
+            temperature=batch.temperature,
         )
 
     def __len__(self) -> int:
         """R, the number of sensors."""
         return len(self.poses)
 
-    def where(self, at: int, pose: int) -> str:
-        """Return how to name a pose of the sensor number `at`: by its label or its line."""
-        return self.readings(at).where(pose)
+    def warnings(self, at: int) -> tuple[Notice, ...]:
+        """Return what the reader warns of the sensor number `at`."""
+        return self.readings(at).warnings if self.doubtful[at] else ()
 
     def real(self, first: int, width: int) -> Bool:
         """Return which of the poses from `first` on are no repetitions, shape (R, width)."""
@@ -204,7 +211,25 @@ class Sample:
             labelled=self.labelled[index],
             in_time=self.in_time[index],
             readings=lambda at: self.readings(numbers[at]),
+            where=lambda at, pose: self.where(numbers[at], pose),
             **parts,
+        )
+
+    def alone(self, at: int) -> Sample:
+        """Return the sensor number `at` by itself, without repetitions of its last pose."""
+        one, poses = self.take(np.array([at])), int(self.poses[at])
+
+        def cut(values: Float | None) -> Float | None:
+            return None if values is None else values[:, :poses]
+
+        return replace(
+            one,
+            blocks=lambda: ((first, block[:, : poses - first]) for first, block in one.blocks()),
+            count=cut(one.count),
+            scatter=cut(one.scatter),
+            cross=cut(one.cross),
+            reference=cut(one.reference),
+            temperature=cut(one.temperature),
         )
 
     def with_output(self, output: Float) -> Sample:

@@ -213,11 +213,12 @@ def search_box(triangle: Triangle, settings: Settings) -> tuple[Box, tuple[str, 
     index = index[_trustworthy(triangle.take(index), K[index], D[index], settings)]
     closed = np.zeros(sensors, dtype=bool)
     closed[index] = True
-    sphere_K, sphere_D = _sphere(triangle, settings.g)
     if unknowns == 12:
         # Of the twelve-parameter valley the symmetric point is the one closest to no rotation.
         K[index] = to_gauge(K[index], "symmetric")
-    K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
+    if not closed.all():
+        sphere_K, sphere_D = _sphere(triangle, settings.g)
+        K, D = np.where(closed[:, None, None], K, sphere_K), np.where(closed[:, None], D, sphere_D)
     box = _box(K, D, settings, unknowns)
     u = Streams(settings.seed, [0], Purpose.BOX).uniform(1, unknowns)[0, 0]
     moved = box.centre + SHIFT * (2.0 * u - 1.0) * box.half
@@ -269,6 +270,12 @@ def half_widths(scale: Float, box: BoxSettings, g: float, unknowns: int) -> Floa
     alike = scale.max(axis=-1, keepdims=True) <= ALIKE * scale.min(axis=-1, keepdims=True)
     turned = np.where(alike, turned, own)
     return np.concatenate([box.scale * scale, turned, box.bias * g * scale], axis=-1)
+
+
+def edge_names(at_wall: Bool) -> tuple[str, ...]:
+    """Return the names of the unknowns that are at a wall of the box, of those marked in shape (D,)."""
+    matrix = ("K_11", "K_22", "K_33", "K_21", "K_31", "K_32", "K_12", "K_13", "K_23")[: len(at_wall) - 3]
+    return tuple(n for n, at in zip((*matrix, "D_1", "D_2", "D_3"), at_wall, strict=True) if at)
 
 
 def state(sample: Sample, settings: Settings) -> Stated:

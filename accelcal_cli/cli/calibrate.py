@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from accelcal_cli.calibration.settings import Settings
     from accelcal_cli.views.blocks import Block, Table
 
-ROBUST = ("none", "huber", "soft-l1")
-ATTITUDES = ("unknown", "known")
 PRESETS = ("printed", "tuned")
 
 in_model, in_search = options.panel("Model"), options.panel("Search")
@@ -59,7 +57,7 @@ class ModelOptions:
         in_model(
             help="Attitudes of the poses: {choices} (from columns fx, fy, fz).",
             show_default="unknown",
-            autocompletion=options.one_of(ATTITUDES),
+            autocompletion=options.one_of(options.ATTITUDES),
         ),
     ] = None
     weights: Annotated[
@@ -72,7 +70,7 @@ class ModelOptions:
     ] = None
     robust: Annotated[
         str | None,
-        in_model(help="Loss: {choices}.", show_default="none", autocompletion=options.one_of(ROBUST)),
+        in_model(help="Loss: {choices}.", show_default="none", autocompletion=options.one_of(options.ROBUST)),
     ] = None
 
 

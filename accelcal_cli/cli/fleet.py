@@ -13,7 +13,7 @@ import typer
 
 from accelcal_cli.cli import meta as metadata
 from accelcal_cli.cli import options, process, wear
-from accelcal_cli.errors import AccelcalError, ConfigError, UsageError
+from accelcal_cli.errors import AccelcalError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -70,9 +70,35 @@ def command(
     weights: Annotated[
         str | None,
         in_model(
-            help="Weight of each pose: {choices} (auto with --raw only).",
+            help="Weight of each pose: {choices}.",
             show_default="none; auto with --raw",
             autocompletion=options.one_of(options.WEIGHTS),
+        ),
+    ] = None,
+    robust: Annotated[
+        str | None,
+        in_model(help="Loss: {choices}.", show_default="none", autocompletion=options.one_of(options.ROBUST)),
+    ] = None,
+    misalignment: Annotated[
+        bool | None,
+        in_model(
+            help="Estimate misalignments; without, the axes are taken as perpendicular.",
+            show_default="misalignment",
+        ),
+    ] = None,
+    attitudes: Annotated[
+        str | None,
+        in_model(
+            help="Attitudes of the poses: {choices} (from columns fx, fy, fz).",
+            show_default="unknown",
+            autocompletion=options.one_of(options.ATTITUDES),
+        ),
+    ] = None,
+    temperature: Annotated[
+        bool | None,
+        in_model(
+            help="Estimate temperature slopes, where a column determines them; sensor by sensor, for result files.",
+            show_default="temperature with --raw",
         ),
     ] = None,
     raw: Annotated[
@@ -110,9 +136,9 @@ def command(
     Exit code 1 means that a sensor is suspect, undetermined or failed, or missed the --tolerance.
     """
     from accelcal_cli.calibration.fleet import calibrate_each, calibrate_fleet, check_settings
-    from accelcal_cli.calibration.settings import load_settings
+    from accelcal_cli.calibration.settings import load_settings, weights_of_log
     from accelcal_cli.config import load_mapping
-    from accelcal_cli.io.fleet import read_fleet
+    from accelcal_cli.io.fleet import COLD, read_fleet
     from accelcal_cli.output.files import whole_folder
     from accelcal_cli.output.machine import write_result
 
@@ -127,17 +153,23 @@ def command(
     if worn:
         wear.check(raw, log)
     stated_g = gravity.stated()
-    stated = options.stated(g=stated_g, gauge=gauge, weights=weights)
+    stated = options.stated(
+        g=stated_g,
+        gauge=gauge,
+        weights=weights,
+        robust=robust,
+        misalignment=misalignment,
+        attitudes=attitudes,
+        temperature=temperature,
+    )
     filed = {} if config is None else load_mapping(config)
     if "optimizer" not in filed:
         stated["optimizer"] = "levenberg-marquardt"
     if raw and "weights" not in filed:
-        stated.setdefault("weights", "auto")
+        stated.setdefault("weights", weights_of_log({**filed, **stated}))
+    if not raw and "temperature" not in filed:
+        stated.setdefault("temperature", False)
     settings = load_settings(config, stated)
-    if filed.get("temperature") is True and not raw:  # the default asks for nothing, a file does
-        raise ConfigError(
-            f"{config}: temperature: true: a fleet goes without slopes; calibrate this sensor by itself"
-        )
     check_settings(settings, each=raw)
 
     def local_g(unit: str | None) -> float:
@@ -161,6 +193,7 @@ def command(
             options=form.read_options(),
         )
         notes = list(dict.fromkeys(note for origin in readings.origins for note in origin.notes))
+        notes += [COLD] if readings.warm and not settings.temperature else []
         labels, g, run = readings.sensors, local_g(readings.unit), partial(calibrate_fleet, readings)
     settings = replace(settings, g=g)
     if folder and output is not None:

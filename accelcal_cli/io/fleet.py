@@ -28,8 +28,9 @@ from accelcal_cli.notices import Notice
 SLAB = 2_000_000
 """Poses that are in memory at once, unless one sensor has more."""
 
-BATCH = 16_384
-"""Poses of a batch at most, unless one sensor has more: few enough for the processor's caches."""
+BATCH = 32_768
+"""Poses of a batch at most, unless one sensor has more: arrays that a third-level cache holds, and so many sensors that
+the interpreter is a small part."""
 
 STRETCH = 1.25
 """No sensor of a batch has more than so many times the poses of another."""
@@ -37,7 +38,7 @@ STRETCH = 1.25
 MOST_POSES = 20_000_000
 """Poses with a label of their own in one table, at most."""
 
-COLD = "Temperature column not used: calibrate fits slopes with temperature, one sensor at a time."
+COLD = "Temperature column not used; --temperature fits slopes with it, sensor by sensor."
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,12 @@ class TableOrigin:
     timed: bool
 
 
-EXTRAS: tuple[int | slice, ...] = (0, slice(1, 4), slice(4, 7))
-"""Where the store of what is known beside the output has the readings behind a pose, their standard deviations, and
-their covariances."""
+EXTRAS: tuple[int | slice, ...] = (0, slice(1, 4), slice(4, 7), slice(7, 10), 10)
+"""Where the store of what is known beside the output has the readings behind a pose, their standard deviations, their
+covariances, the known specific force and the temperature."""
+
+WIDTH = 11
+"""Columns of that store."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,7 @@ class Batch:
         behind: raw readings behind each pose, shape (R, J), NaN where not known; None where no table has them.
         scatter: standard deviation of one of them, shape (R, J, 3), sensor units, likewise; cross: covariances xy, xz
             and yz of one, shape (R, J, 3), sensor units squared, likewise.
+        reference: known specific force, shape (R, J, 3), and temperature, shape (R, J), likewise.
     """
 
     sensors: Int
@@ -87,6 +92,8 @@ class Batch:
     behind: Float | None = None
     scatter: Float | None = None
     cross: Float | None = None
+    reference: Float | None = None
+    temperature: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +116,13 @@ class FleetReadings:
     zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     @property
+    def warm(self) -> bool:
+        """Whether a table has temperatures."""
+        return self._extras is not None and any(
+            not np.isnan(block[:, EXTRAS[-1]]).all() for _, block in self._extras.blocks()
+        )
+
+    @property
     def unit(self) -> str | None:
         """Unit of the readings where all tables state the same."""
         units = {origin.form.unit for origin in self.origins}
@@ -123,8 +137,9 @@ class FleetReadings:
         origin = self.origin(pose)
         return origin.where(pose - origin.first)
 
-    def one(self, batch: Batch, at: int) -> Readings:
-        """Return the readings of the sensor at `at` in a batch, as `calibrate` takes them."""
+    def one(self, batch: Batch, at: int, *, screened: bool = True) -> Readings:
+        """Return the readings of the sensor at `at` in a batch, as `calibrate` takes them; those that are not doubtful
+        need not be screened."""
         count, poses = int(batch.count[at]), batch.pose[at]
         origin, name = self.origin(int(poses[0])), self.sensors[batch.sensors[at]]
         return Readings.from_array(
@@ -133,7 +148,9 @@ class FleetReadings:
             count=_known(batch.behind, at, count),
             scatter=_known(batch.scatter, at, count),
             cross=_known(batch.cross, at, count),
-            warnings=self.warnings(batch, at),
+            reference=_known(batch.reference, at, count),
+            temperature=_known(batch.temperature, at, count),
+            warnings=self.warnings(batch, at) if screened else (),
         ).known_as(
             origin.sha256,
             origin.columns,
@@ -157,6 +174,7 @@ class FleetReadings:
             count=_known(batch.behind, at, first),
             scatter=_known(batch.scatter, at, first),
             zeros=sensor in self.zeros,
+            warm=_known(batch.temperature, at, first) is not None,
         )
         return (*screened.notices(), *zero_rows(*self.zeros.get(sensor, (0, "")), count))
 
@@ -202,11 +220,7 @@ class FleetReadings:
             at = order[starts[index, None] + steps]
             count, output = counts[index], rows[at, 1:]
             yield Batch(
-                first + index,
-                count,
-                output,
-                pose[at],
-                *(None if extras is None else extras[at][..., part] for part in EXTRAS),
+                first + index, count, output, pose[at], *_parts(None if extras is None else extras[at])
             )
 
     def _select(self, first: int, last: int) -> tuple[Float, Int]:
@@ -241,6 +255,13 @@ def _groups(counts: Int) -> Iterator[slice]:
         last = min(alike, first + max(1, BATCH // longest))
         yield slice(first, last)
         first = last
+
+
+def _parts(extras: Float | None) -> Iterator[Float | None]:
+    """Yield what is known of poses beside the output, by `EXTRAS`; None for what is known of none."""
+    for part in EXTRAS:
+        values = None if extras is None else extras[..., part]
+        yield None if values is None or np.isnan(values).all() else values
 
 
 def _known(extra: Float | None, at: int, count: int) -> Float | None:
@@ -333,7 +354,7 @@ class _FleetCollector:
         if column in columns.output:
             shown = columns.names[columns.output.index(column)]
             raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
-        means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
+        means = _means_of(table.name, columns)
         zeros, idle, rows_read = ZeroRows(), dict[int, list[int]](), 0
         for rows in table.blocks(columns.selection()):
             if not len(rows.numbers):
@@ -347,14 +368,14 @@ class _FleetCollector:
             if keep is not None:
                 _set_aside(idle, codes, keep, rows.start)
                 codes, numbers, label = codes[keep], numbers[keep], list(compress(label, keep.tolist()))
-            output, (count, scatter, _) = numbers[:, :3], columns.split(numbers[:, 3:])
+            output, (count, scatter, more) = numbers[:, :3], columns.split(numbers[:, 3:])
             if means is None:
-                self._add(codes, output, count, scatter)
+                self._add(codes, output, count, scatter, None, *_of_others(columns, more))
             else:
-                means.add(list(zip(codes.tolist(), label, strict=True)), output, count, scatter)
+                own = list(zip(codes.tolist(), label, strict=True))
+                means.add(own, np.hstack([output, more]), count, scatter)
         if means is not None:
-            codes = np.array([code for code, _ in means.index], dtype=np.intp)
-            self._add(codes, means.mean, means.count(), means.scatter(), means.cross())
+            self._add_means(means, columns)
         self._note_zeros(idle, table.where)
         place = _past_zeros(table.where, zeros) if zeros.count else table.where
         self.origins.append(
@@ -364,12 +385,18 @@ class _FleetCollector:
                 columns.names,
                 first,
                 place if means is None else _by_label([label for _, label in means.index]),
-                (*table.notes, *columns.notes, *(() if columns.temperature is None else (COLD,))),
+                (*table.notes, *columns.notes),
                 InputForm(table.source_format, rows_read, table.rows_skipped, None, columns.unit),
                 rows=means is None,
                 timed=columns.time is not None,
             )
         )
+
+    def _add_means(self, means: LabelledMeans[tuple[int, str]], columns: Columns) -> None:
+        """Add the poses that labels made."""
+        codes = np.array([code for code, _ in means.index], dtype=np.intp)
+        known = means.count(), means.scatter(), means.cross()
+        self._add(codes, means.mean[:, :3], *known, *_of_others(columns, means.mean[:, 3:]))
 
     def _note_zeros(self, idle: dict[int, list[int]], where: Callable[[int], str]) -> None:
         """Note the rows of zeros of each sensor; one that has nothing else keeps them."""
@@ -389,19 +416,22 @@ class _FleetCollector:
         behind: Float | None,
         scatter: Float | None,
         cross: Float | None = None,
+        reference: Float | None = None,
+        temperature: Float | None = None,
     ) -> None:
         """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""
+        known = behind, scatter, cross, reference, temperature
         before = self.store.rows
         self.poses = np.pad(self.poses, (0, len(self.index) - len(self.poses)))
         self.poses += np.bincount(codes, minlength=len(self.poses))
         self.store.append(np.column_stack([codes, output]))
-        if behind is None and scatter is None and self.extras is None:
+        if all(part is None for part in known) and self.extras is None:
             return
         if self.extras is None:
-            self.extras = RowStore(7)
-            self.extras.append(np.full((before, 7), np.nan))
-        rows = np.empty((len(codes), 7))
-        for part, values in zip(EXTRAS, (behind, scatter, cross), strict=True):
+            self.extras = RowStore(WIDTH)
+            self.extras.append(np.full((before, WIDTH), np.nan))
+        rows = np.empty((len(codes), WIDTH))
+        for part, values in zip(EXTRAS, known, strict=True):
             rows[:, part] = np.nan if values is None else values
         self.extras.append(rows)
 
@@ -410,6 +440,20 @@ def _set_aside(idle: dict[int, list[int]], codes: Int, keep: Bool, start: int) -
     """Add the rows that are not kept, from `start` on, to those of their sensors, by its number."""
     for row in np.flatnonzero(~keep).tolist():
         idle.setdefault(int(codes[row]), []).append(start + row)
+
+
+def _means_of(source: str, columns: Columns) -> LabelledMeans[tuple[int, str]] | None:
+    """Return what averages the rows of a label: output, known specific force and temperature; None without labels."""
+    others = 3 * (columns.reference is not None) + (columns.temperature is not None)
+    return None if columns.label is None else LabelledMeans(source, 3 + others, MOST_POSES)
+
+
+def _of_others(columns: Columns, others: Float) -> tuple[Float | None, Float | None]:
+    """Return the known specific force, shape (B, 3), and the temperature, shape (B,), of the other columns."""
+    return (
+        None if columns.reference is None else others[:, :3],
+        None if columns.temperature is None else others[:, -1],
+    )
 
 
 def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> list[str]:

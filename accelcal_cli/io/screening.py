@@ -537,14 +537,17 @@ def _is_odd(output: Float, real: Bool) -> Bool:
     half = np.where(high > low, (high - low) / 2, 1.0)
     x = (output - ((low + high) / 2)[:, None]) / half[:, None]
     terms = np.concatenate([x * x, x * x[..., [1, 2, 0]], x], axis=2)
-    joint = _squares_of(terms, real)
     odd |= _off_sphere(x, real) > NO_SPHERE**2 * poses
-    many = np.flatnonzero((joint > SMALLEST * poses) & (poses >= 2 * FEWEST) & ~odd)
+    many = np.flatnonzero((poses >= 2 * FEWEST) & ~odd)
     if len(many):
         terms, real, poses, place = terms[many], real[many], poses[many], np.arange(output.shape[1])
+        joint = _squares_of(terms, real)
+        some = joint > SMALLEST * poses
+        many, terms, real, poses, joint = many[some], terms[some], real[some], poses[some], joint[some]
+    if len(many):
         for first in (place < (poses // 2)[:, None], np.broadcast_to(place % 2 == 0, real.shape)):
             apart = _squares_of(terms, real & first) + _squares_of(terms, real & ~first)
-            odd[many] |= _beyond_chance(joint[many], apart, poses - 18)
+            odd[many] |= _beyond_chance(joint, apart, poses - 18)
     return np.asarray(odd)
 
 

@@ -161,7 +161,7 @@ class _Loop(Generic[S]):
         if not over.any():
             return state
         for status, ended in reasons:
-            for run in self.alive[ended]:
+            for run in self.alive[ended].tolist():
                 self.status[run] = status
         self._leave(np.flatnonzero(over), k)
         rest = np.flatnonzero(~over)
@@ -187,10 +187,9 @@ class _Loop(Generic[S]):
 
     def _outcome(self, numbers: NDArray[np.int64]) -> Run:
         """Return the results of all runs; one without a finite cost has failed."""
-        status = tuple(
-            s if np.isfinite(c) else Status.FAILED for s, c in zip(self.status, self.best_cost, strict=True)
-        )
-        run = Run(numbers, self.best_x, self.best_cost, self.evaluations, self.steps, status)
+        for failed in np.flatnonzero(~np.isfinite(self.best_cost)).tolist():
+            self.status[failed] = Status.FAILED
+        run = Run(numbers, self.best_x, self.best_cost, self.evaluations, self.steps, tuple(self.status))
         if not self.trace:
             return run
         costs = np.empty((len(self.costs), len(numbers)))

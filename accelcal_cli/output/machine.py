@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterable
+from itertools import repeat
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -100,15 +101,17 @@ def frame(table: Table) -> polars.DataFrame:
     import polars
 
     types = {"": polars.String, "d": polars.Int64}
-    columns = [
-        polars.Series(
-            column.label,
-            [_finite(str(row[i]) if isinstance(row[i], tuple) else row[i]) for row in table.rows],
-            dtype=types.get(column.format, polars.Float64),
-        )
-        for i, column in enumerate(table.columns)
-    ]
-    return polars.DataFrame(columns)
+    series = []
+    cells = zip(*table.rows, strict=True) if table.rows else repeat((), len(table.columns))
+    for column, values in zip(table.columns, cells, strict=True):
+        if column.format in types:
+            own = [str(value) if isinstance(value, tuple) else _finite(value) for value in values]
+            series.append(polars.Series(column.label, own, dtype=types[column.format]))
+        else:  # all cells at once: a table of a fleet has millions
+            numbers = np.array(values, dtype=float)
+            numbers[~np.isfinite(numbers)] = np.nan
+            series.append(polars.Series(column.label, numbers, nan_to_null=True))
+    return polars.DataFrame(series)
 
 
 def _finite(value: object) -> object:

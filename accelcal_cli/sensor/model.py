@@ -17,7 +17,7 @@ import math
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.linalg import cholesky, eigh, inv, qr, svd
+from numpy.linalg import cholesky, eigh, qr, svd
 
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import DataError, UsageError
@@ -64,6 +64,10 @@ def to_gauge(K: Float, gauge: str) -> Float:
         return K
     if gauge == "upper":
         return to_gauge(K[..., ::-1, :], "lower")[..., ::-1, ::-1]
+    above, diagonal = K[..., [0, 0, 1], [1, 2, 2]], np.einsum("...ii->...i", K)
+    there = (above == 0).all(axis=-1) & (diagonal > 0).all(axis=-1)
+    if gauge == "lower" and there.all():
+        return K
     sizes = svd(K, compute_uv=False)
     poor = sizes[..., 2] < SQUARABLE * sizes[..., 0]
     squared = np.where(poor[..., None, None], np.eye(3), K)
@@ -72,13 +76,62 @@ def to_gauge(K: Float, gauge: str) -> Float:
         factor = cholesky(product)
         if poor.any():
             factor[poor] = triangular(K[poor])
-        return factor
+        return np.where(there[..., None, None], K, factor)
     values, vectors = eigh(product)
     root: Float = (vectors * np.sqrt(values)[..., None, :]) @ vectors.swapaxes(-1, -2)
     if poor.any():
         axes, sizes, _ = svd(K[poor])
         root[poor] = (axes * sizes[:, None, :]) @ axes.swapaxes(-1, -2)
     return root
+
+
+AROUND = np.array(
+    [
+        [3 * ((j + 1 + a) % 3) + (i + 1 + b) % 3 for i in range(3) for j in range(3)]
+        for a, b in ((0, 0), (1, 1), (0, 1), (1, 0))
+    ]
+)
+"""Which entries of a 3 x 3 matrix the two products of each entry of its adjugate are made of, all as rows of nine; the
+indices go round, which makes the sign."""
+
+
+def inverse(K: Float) -> Float:
+    """Return K^-1 by cofactors, shape (..., 3, 3); inf or NaN where K is singular, and there alone."""
+    flat = K.reshape(-1, 9)
+    first, second, third, fourth = AROUND
+    with np.errstate(all="ignore"):
+        adjugate = flat.take(first, axis=1) * flat.take(second, axis=1)
+        adjugate -= flat.take(third, axis=1) * flat.take(fourth, axis=1)
+        determinant = flat[:, 0] * adjugate[:, 0] + flat[:, 1] * adjugate[:, 3] + flat[:, 2] * adjugate[:, 6]
+        adjugate /= determinant[:, None]
+    return np.asarray(adjugate.reshape(K.shape))
+
+
+def inverse_triangles(L: Float) -> Float:
+    """Return the inverses of lower triangles, shape (p, p, R), in the same layout, all of them at once."""
+    X = np.zeros(L.shape)
+    for k in range(len(L)):
+        X[k, k] = 1.0
+        X[k, : k + 1] /= L[k, k]
+        X[k + 1 :, : k + 1] -= L[k + 1 :, None, k] * X[k, : k + 1]
+    return X
+
+
+def inverse_normal(normal: Float) -> Float:
+    """Return the inverses of symmetric matrices, shape (R, p, p), by their Cholesky factors; NaN where there are none.
+
+    Written column by column over all matrices: twice as fast as LAPACK one by one, and none decides over the others.
+    """
+    A = np.ascontiguousarray(normal.transpose(1, 2, 0))
+    with np.errstate(all="ignore"):
+        for k in range(len(A)):
+            A[k:, k] /= np.sqrt(A[k, k])
+            A[k + 1 :, k + 1 :] -= A[k + 1 :, None, k] * A[k + 1 :, k]
+        X = inverse_triangles(A)
+        P = np.zeros(A.shape)
+        for k in range(len(A)):
+            P[: k + 1, : k + 1] += X[k, : k + 1, None] * X[k, : k + 1]
+    return np.ascontiguousarray(P.transpose(2, 0, 1))
 
 
 def triangular(K: Float) -> Float:
@@ -103,7 +156,7 @@ class ErrorModel:
     @property
     def K_A(self) -> Float:  # noqa: N802
         """Inverse matrix. Definition: K_a^-1. Units: m/s^2 per output unit. Shape (3, 3)."""
-        return inv(self.K)
+        return inverse(self.K)
 
     @property
     def f_0(self) -> Float:

@@ -188,6 +188,27 @@ def _plain(value: object) -> object:
     return re.sub(r"[\w./-]+\.csv,? line", "line", value) if isinstance(value, str) else value
 
 
+MORE = (
+    {"robust": "huber"},
+    {"robust": "soft-l1", "weights": "n"},
+    {"weights": "auto"},
+    {"misalignment": False},
+)
+"""What a fleet does beside weights, of every tenth sensor."""
+
+
+@pytest.mark.parametrize("more", MORE, ids=str)
+def test_a_fleet_does_what_one_sensor_is_asked_for(devices, more):
+    settings = Settings(**{"optimizer": "levenberg-marquardt", "g": G, **more})
+    part = [path for one, path in devices if one.kind != "labels"][MORE.index(more) :: 7]
+    wrong = [
+        f"{path.stem}: {difference}"
+        for path, record in zip(part, as_fleet(part, settings), strict=True)
+        for difference in differences(record, by_itself(path, settings))
+    ]
+    assert not wrong, "\n".join([f"{len(wrong)} differences", *wrong])
+
+
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_a_fleet_is_calibrated_as_its_sensors_one_by_one(devices, weights):
     settings = Settings(optimizer="levenberg-marquardt", g=G, weights=weights)
@@ -238,6 +259,43 @@ def test_no_pose_without_noise_is_an_outlier(devices, weights):
         if not isinstance(record, str) and record.outliers
     }
     assert not named
+
+
+@pytest.mark.parametrize("kind", ["temperature", "attitudes"])
+def test_temperatures_and_known_attitudes_are_those_of_each_sensor(tmp_path, kind):
+    """Sensors of 24 poses that warm up, one of which has none of the temperatures, or attitudes in one plane."""
+    paths = []
+    for number in range(4):
+        rng = np.random.default_rng(number)
+        u = _some(rng, 24, 25)
+        if kind == "attitudes" and number == 2:
+            u[:, 2] = 0.0
+            u /= np.linalg.norm(u, axis=1, keepdims=True)
+        model = draw(TYPE, [number], 4)
+        output = (G * u + 0.01 * rng.normal(size=u.shape)) @ model.K[0].T + model.D[0]
+        warmth = rng.permutation(np.linspace(10.0, 40.0, len(u)))
+        output += 0.2 * (warmth[:, None] - 25.0) * (kind == "temperature")
+        more = warmth[:, None] if kind == "temperature" else G * u
+        rows = [f"{_cells(row)},{_cells(own)}" for row, own in zip(output, more, strict=True)]
+        if kind == "temperature" and number == 2:
+            rows = [row.rpartition(",")[0] + "," for row in rows]
+        names = "temperature" if kind == "temperature" else "fx,fy,fz"
+        path = tmp_path / f"{number}.csv"
+        path.write_text("\n".join([f"ax,ay,az,{names}", *rows, ""]))
+        paths.append(path)
+    known = {"attitudes": "known"} if kind == "attitudes" else {}
+    settings = Settings(**{"optimizer": "levenberg-marquardt", "g": G, **known})
+    records = as_fleet(paths, settings)
+    for path, record in zip(paths, records, strict=True):
+        alone = by_itself(path, settings)
+        assert not differences(record, alone), path.stem
+        if isinstance(record, Calibration) and isinstance(alone, Calibration):
+            assert (record.temperature is None) == (alone.temperature is None)
+    if kind == "temperature":
+        found = [record.temperature for record in records if isinstance(record, Calibration)]
+        assert [slopes is None for slopes in found] == [False, False, True, False]
+    else:
+        assert [isinstance(record, str) for record in records] == [False, False, True, False]
 
 
 def test_one_sensor_without_scatter_fails_alone(tmp_path):

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import shutil
 from itertools import zip_longest
 from pathlib import Path
 
@@ -258,18 +259,23 @@ def test_a_temperature_column_is_not_used_and_that_is_said(run, table):
     Path("warm.csv").write_text("\n".join(warm))
     plain, told = (run("fleet", name, "--format", "csv") for name in (table, "warm.csv"))
     assert told.out == plain.out
-    note = "Temperature column not used: calibrate fits slopes with temperature, one sensor at a time."
+    note = "Temperature column not used; --temperature fits slopes with it, sensor by sensor."
     assert note not in plain.err
     assert f"accelcal: {note}\n" in told.err
 
 
-def test_slopes_with_temperature_that_a_file_asks_for_are_refused(run, table):
+def test_slopes_with_temperature_are_fitted_when_asked_for(run, table):
+    rows = Path(table).read_text().splitlines()
+    warm = [f"{row},{'temperature' if k == 0 else 20 + k % 12}" for k, row in enumerate(rows)]
+    Path("warm.csv").write_text("\n".join(warm))
     Path("warm.yaml").write_text("temperature: true\n")
-    refused = run("fleet", table, "--config", "warm.yaml")
-    assert refused.code == 2
-    assert refused.err.startswith("accelcal: warm.yaml: temperature: true: a fleet goes without")
-    Path("cold.yaml").write_text("temperature: false\n")
-    assert run("fleet", table, "--config", "cold.yaml").code == 0
+    for asked in (("--temperature",), ("--config", "warm.yaml")):
+        done = run("fleet", "warm.csv", *asked, "-o", "results/")
+        assert "Temperature column not used" not in done.err
+        notes = [note for path in Path("results").iterdir() for note in json.loads(path.read_text())["notes"]]
+        assert notes
+        assert all("emperature" in note for note in notes)
+        shutil.rmtree("results")
 
 
 # Raw logs
@@ -365,7 +371,7 @@ def test_a_raw_log_from_standard_input(run, logs):
         (("--raw", "--merge", "1", "--thin", "2"), "--merge and --thin: expected one of them"),
         (("--raw", "--columns", "a,b,c"), 'no column "a" in s1.csv'),
         (("--raw", "--gauge", "full"), "gauge: full: a fleet goes with"),
-        (("--weights", "auto"), "weights: auto: a fleet goes with none, n, sd only"),
+        (("--weights", "auto"), "--weights auto needs"),
     ],
 )
 def test_what_does_not_go_with_logs_is_refused(run, logs, arguments, part):
