@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 FAILED = "failed"
 """Verdict on a sensor that cannot be calibrated: a single pose, all of them equal, or weights that it does not give."""
 
+UNWEIGHTED = "--weights"
+"""Where the reason of a sensor begins that does not give the weights asked for."""
+
 NAMED = 3
 """Outlying poses of a sensor that are named one by one."""
 
@@ -209,6 +212,19 @@ def calibrate_fleet(
         ConfigError: settings that are not for a fleet.
         DataError: not one sensor gives the weights asked for.
     """
+    fleet = calibrate_part(readings, settings, keep)
+    if all(reason.startswith(UNWEIGHTED) for reason in fleet.reason):
+        label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
+        raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
+    return fleet
+
+
+def calibrate_part(
+    readings: FleetReadings,
+    settings: Settings,
+    keep: Callable[[int, Calibration], None] | None = None,
+) -> Fleet:
+    """Calibrate the sensors of a part of a fleet; as `calibrate_fleet`, but no sensor need give the weights."""
     check_settings(settings)
     parts = []
     for batch in readings.batches():
@@ -224,11 +240,7 @@ def calibrate_fleet(
             if keep is not None:
                 for at, number in enumerate(numbers.tolist()):
                     keep(number, record(assessment, at))
-    fleet = _joined(parts)
-    if all(reason.startswith("--weights") for reason in fleet.reason):
-        label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
-        raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
-    return fleet
+    return _joined(parts)
 
 
 def calibrate_each(
@@ -364,7 +376,7 @@ def _units(g: float) -> Float:
     return np.repeat([1.0, units.MRAD, units.MICRO_G / g], 3)
 
 
-def _gains(fleet: Fleet, g: float) -> Float:
+def parameter_gains(fleet: Fleet, g: float) -> Float:
     """Return the errors of `Fleet.parameters` over the noise of a pose in m/s^2, shape (R, 9)."""
     gains = fleet.gain * _units(g)
     gains[:, SCALE] *= fleet.parameters[:, SCALE]
@@ -385,7 +397,7 @@ def standouts(fleet: Fleet, g: float) -> list[Standout]:
     found = []
     shared = _shared_variance(fleet)
     pose = np.fmax(fleet.s[known], np.sqrt(shared))  # few poses estimate it too small at times
-    gains = _gains(fleet, g)[known]
+    gains = parameter_gains(fleet, g)[known]
     for p, name in enumerate(PARAMETERS):
         values = fleet.parameters[known, p]
         middle = float(np.median(values))

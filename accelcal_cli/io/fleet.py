@@ -1,14 +1,16 @@
 """Static readings of many sensors, from one table with a column that labels the sensor, or from one file per sensor.
 
-`read_fleet` gathers the rows into stores that may be on disk; `FleetReadings.batches` yields the sensors in batches of
-about equally many poses, as arrays that fit the caches of the processor.
+`read_fleet` gathers the rows into stores that may be on disk. `FleetReadings.parts` cuts a fleet into parts that other
+processes can take; `FleetReadings.batches` yields the sensors in batches of about equally many poses, as arrays that
+fit the caches of the processor.
 """
 
 from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import compress
 from pathlib import Path
 from typing import BinaryIO
@@ -20,13 +22,24 @@ from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.columns import Columns, choose, own_sensor_column, restrict, sensor_column
 from accelcal_cli.io.reader import PLAIN, InputTable, ReadOptions, open_table
 from accelcal_cli.io.readings import InputForm, LabelledMeans, Readings, number_labels
-from accelcal_cli.io.rows import RowBlock, ZeroRows, add_stretches, places, zero_rows
+from accelcal_cli.io.rows import (
+    RowBlock,
+    ZeroRows,
+    add_stretches,
+    left_row,
+    places,
+    set_aside,
+    zero_rows,
+)
 from accelcal_cli.io.screening import LOOKED_AT, ROW_WIDE, UNEQUAL, Screened, needs_look
 from accelcal_cli.io.stream import RowStore, Source
 from accelcal_cli.notices import Notice
 
 SLAB = 2_000_000
 """Poses that are in memory at once, unless one sensor has more."""
+
+PART = 49_152
+"""Poses of a part of a fleet, up to the end of a sensor: what a worker gets, and what is kept of an interrupted run."""
 
 BATCH = 16_384
 """Poses of a batch at most, unless one sensor has more: few enough for the processor's caches."""
@@ -98,6 +111,7 @@ class FleetReadings:
         sensors: their labels, in the order in which they came; poses: J of each, shape (R,).
         origins: the tables, in their order.
         zeros: rows that were zero in all axes and were left out, by number of the sensor: how many, and which.
+        in_order: whether all poses of a sensor came one after the other.
     """
 
     source: str
@@ -107,6 +121,8 @@ class FleetReadings:
     _store: RowStore = field(repr=False)  # number of the sensor, output
     _extras: RowStore | None = field(repr=False)  # readings behind the pose, their standard deviation
     zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
+    in_order: bool = False
+    _numbers: Int | None = field(default=None, repr=False)  # of the poses among those of all parts
 
     @property
     def unit(self) -> str | None:
@@ -188,10 +204,56 @@ class FleetReadings:
             yield from self._slab(first, last)
             first = last
 
+    def parts(self) -> Iterator[FleetReadings]:
+        """Yield the sensors in parts of about PART poses: readings of their own, which another process can take.
+
+        The cuts depend on the readings alone.
+        """
+        bounds = cuts(self.poses)
+        if len(bounds) < 2:
+            yield self
+            return
+        ends, at = np.cumsum(self.poses), 0
+        while at < len(
+            bounds
+        ):  # as many parts as fit into memory: rows in any order are searched once for all of them
+            first, behind = bounds[at][0], at + 1
+            start = int(ends[first] - self.poses[first])
+            while behind < len(bounds) and ends[bounds[behind][1] - 1] - start <= SLAB:
+                behind += 1
+            last = bounds[behind - 1][1]
+            rows, pose = self._select(first, last)
+            extras = None if self._extras is None else _gather(self._extras, pose)
+            order = np.argsort(rows[:, 0], kind="stable")
+            for low, high in bounds[at:behind]:
+                own = order[int(ends[low] - self.poses[low]) - start : int(ends[high - 1]) - start]
+                yield self._part(low, high, rows[own], None if extras is None else extras[own], pose[own])
+            at = behind
+
+    def _part(self, first: int, last: int, rows: Float, extras: Float | None, pose: Int) -> FleetReadings:
+        """Return the sensors from `first` to `last` - 1, whose poses are these rows."""
+        store, more = RowStore(4), None if extras is None else RowStore(7)
+        rows[:, 0] -= first
+        store.append(rows)
+        if more is not None and extras is not None:
+            more.append(extras)
+        return replace(
+            self,
+            sensors=self.sensors[first:last],
+            poses=self.poses[first:last],
+            origins=tuple(_origin_of(origin, pose) for origin in self.origins),
+            zeros={code - first: said for code, said in self.zeros.items() if first <= code < last},
+            in_order=True,
+            _store=store,
+            _extras=more,
+            _numbers=pose,
+        )
+
     def _slab(self, first: int, last: int) -> Iterator[Batch]:
         """Yield the sensors from `first` to `last` - 1."""
         rows, pose = self._select(first, last)
         extras = None if self._extras is None else _gather(self._extras, pose)
+        pose = pose if self._numbers is None else self._numbers[pose]
         order = np.argsort(rows[:, 0], kind="stable")
         counts = self.poses[first:last]
         starts = np.cumsum(counts) - counts
@@ -213,6 +275,9 @@ class FleetReadings:
         """Return the rows of the sensors from `first` to `last` - 1 and the numbers of their poses."""
         if last - first == len(self.poses):
             return self._store.all(), np.arange(self._store.rows)
+        if self.in_order:
+            start, count = int(self.poses[:first].sum()), int(self.poses[first:last].sum())
+            return self._store.part(start, start + count), np.arange(start, start + count)
         rows, numbers = [], []
         for start, block in self._store.blocks():
             chosen = np.flatnonzero((block[:, 0] >= first) & (block[:, 0] < last))
@@ -221,10 +286,31 @@ class FleetReadings:
         return np.concatenate(rows), np.concatenate(numbers)
 
 
+def cuts(rows: Int) -> list[tuple[int, int]]:
+    """Return the parts of a fleet whose sensors have so many rows, shape (R,): first sensor, and the one behind."""
+    ends, first, bounds = np.cumsum(rows), 0, []
+    while first < len(ends):
+        before = int(ends[first] - rows[first])
+        last = min(int(np.searchsorted(ends, before + PART)) + 1, len(ends))
+        bounds.append((first, last))
+        first = last
+    return bounds
+
+
+def _origin_of(origin: TableOrigin, pose: Int) -> TableOrigin:
+    """Return the origin of some poses alone: of their labels where poses have labels."""
+    if not isinstance(origin.where, _Labels):
+        return origin
+    own = pose[(pose >= origin.first) & (pose < origin.first + len(origin.where.names))] - origin.first
+    return replace(origin, where=origin.where.only(own.tolist()))
+
+
 def _gather(store: RowStore, numbers: Int) -> Float:
     """Return the rows of these numbers, which ascend."""
     if len(numbers) == store.rows:
         return store.all()
+    if len(numbers) and numbers[-1] - numbers[0] == len(numbers) - 1:
+        return store.part(int(numbers[0]), int(numbers[-1]) + 1)
     placed = (
         (start, block, *np.searchsorted(numbers, (start, start + len(block))))
         for start, block in store.blocks()
@@ -270,23 +356,22 @@ def read_fleet(
     check_once(sources)
     each = len(sources) > 1 and sensor is None
     names: Sequence[str | None] = file_names(list(map(str, sources))) if each else [None] * len(sources)
-    collector = _FleetCollector()
+    collector = FleetCollector(columns, sensor, options)
     for source, name in zip(sources, names, strict=True):
-        table = open_table(source, stdin, options=options)
-        try:
-            restrict(table, options.where)
-            collector.read(table, columns, sensor, name, options.count)
-        finally:
-            table.close()
+        collector.open(source, name, stdin)
     label = collector.origins[0].name if len(sources) == 1 else f"{len(sources)} files"
-    if not each and collector.store.rows == len(collector.index) > 1:
+    if not each:
+        check_poses(label, len(collector.index), collector.store.rows)
+    return collector.readings(label)
+
+
+def check_poses(name: str, sensors: int, poses: int) -> None:
+    """Raise DataError where every row has another sensor."""
+    if poses == sensors > 1:
         raise DataError(
-            f"{label}: every row has another sensor; expected several poses of each (--sensor-column says which "
+            f"{name}: every row has another sensor; expected several poses of each (--sensor-column says which "
             "column labels the sensor)"
         )
-    sensors, origins = tuple(collector.index), tuple(collector.origins)
-    zeros = collector.zeros
-    return FleetReadings(label, sensors, collector.poses, origins, collector.store, collector.extras, zeros)
 
 
 def check_once(sources: Sequence[Source]) -> None:
@@ -307,10 +392,37 @@ def file_names(sources: Sequence[str]) -> Sequence[str]:
     return names if len(set(names)) == len(names) else sources
 
 
-@dataclass(eq=False)
-class _FleetCollector:
-    """Gathers the rows of tables into poses of sensors."""
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Some rows of a typed table, whose sensors are known.
 
+    Attributes:
+        first: the first row, from 0; sensors: their labels, each once; rows: of each, shape (R,).
+        total, sha256: rows and hash of the whole table.
+    """
+
+    first: int
+    sensors: list[str]
+    rows: Int
+    total: int
+    sha256: str
+
+
+@dataclass(eq=False)
+class FleetCollector:
+    """Gathers the rows of tables into poses of sensors.
+
+    Attributes:
+        wanted: the three output columns, `sensor`: the one that labels the sensor, None to find them.
+        options: what the user knows of the form of a table.
+        in_order: whether all poses of a sensor came one after the other.
+    """
+
+    wanted: Sequence[str] | None = None
+    sensor: str | None = None
+    options: ReadOptions = PLAIN
+    in_order: bool = True
+    _last: int = -1
     index: dict[str, int] = field(default_factory=dict)
     poses: Int = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     store: RowStore = field(default_factory=lambda: RowStore(4))
@@ -318,34 +430,61 @@ class _FleetCollector:
     origins: list[TableOrigin] = field(default_factory=list)
     zeros: dict[int, tuple[int, str]] = field(default_factory=dict)
 
-    def read(
+    def open(
         self,
-        table: InputTable,
-        wanted: Sequence[str] | None,
-        sensor: str | None,
+        source: Source,
         name: str | None,
-        counts: str | None = None,
+        stdin: BinaryIO | None = None,
+        window: Window | None = None,
     ) -> None:
         """Read one table: of the sensor `name`, or of many."""
-        first = self.store.rows
-        column = sensor_column(table, sensor) if name is None else own_sensor_column(table)
-        columns = choose(table, wanted, column, counts)
+        table = open_table(source, stdin, hashed=window is None, options=self.options)
+        try:
+            restrict(table, self.options.where)
+            self.read(table, name, window)
+        finally:
+            table.close()
+
+    def readings(self, source: str) -> FleetReadings:
+        """Return what was gathered."""
+        return FleetReadings(
+            source,
+            tuple(self.index),
+            self.poses,
+            tuple(self.origins),
+            self.store,
+            self.extras,
+            self.zeros,
+            self.in_order,
+        )
+
+    def columns(self, table: InputTable, name: str | None) -> Columns:
+        """Return the columns of a table: of the sensor `name`, or of many."""
+        column = sensor_column(table, self.sensor) if name is None else own_sensor_column(table)
+        columns = choose(table, self.wanted, column, self.options.count)
         if column in columns.output:
             shown = columns.names[columns.output.index(column)]
             raise UsageError(f'--sensor-column: column "{shown}" of {table.name} is a reading, not a label')
+        return columns
+
+    def read(self, table: InputTable, name: str | None, window: Window | None = None) -> None:
+        """Read one table: of the sensor `name`, or of many, or a window of it."""
+        first = self.store.rows
+        columns = self.columns(table, name)
         means = None if columns.label is None else LabelledMeans[tuple[int, str]](table.name, 3, MOST_POSES)
         zeros, idle, rows_read = ZeroRows(), dict[int, list[int]](), 0
-        for rows in table.blocks(columns.selection()):
-            if not len(rows.numbers):
-                continue
+        if window is not None and columns.reference is not None:
+            zeros.rows.add(0, window.first)
+        for rows, codes in self._coded(table, columns, name, window):
             rows_read += len(rows.numbers)
             columns.check(table, rows)
-            labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
-            codes = number_labels(self.index, labels)
-            numbers, label = rows.numbers, rows.texts[columns.sensor is not None] if means is not None else ()
+            numbers, label = (
+                rows.numbers,
+                rows.texts[columns.sensor is not None and window is None] if means is not None else (),
+            )
             keep = None if columns.reference is not None else zeros.keep(numbers[:, :3], rows.start)
             if keep is not None:
-                _set_aside(idle, codes, keep, rows.start)
+                set_aside(idle, codes, keep, rows.start)
                 codes, numbers, label = codes[keep], numbers[keep], list(compress(label, keep.tolist()))
             output, (count, scatter, _) = numbers[:, :3], columns.split(numbers[:, 3:])
             if means is None:
@@ -356,20 +495,32 @@ class _FleetCollector:
             codes = np.array([code for code, _ in means.index], dtype=np.intp)
             self._add(codes, means.mean, means.count(), means.scatter(), means.cross())
         self._note_zeros(idle, table.where)
-        place = _past_zeros(table.where, zeros) if zeros.count else table.where
-        self.origins.append(
-            TableOrigin(
-                table.name,
-                table.sha256,
-                columns.names,
-                first,
-                place if means is None else _by_label([label for _, label in means.index]),
-                (*table.notes, *columns.notes, *(() if columns.temperature is None else (COLD,))),
-                InputForm(table.source_format, rows_read, table.rows_skipped, None, columns.unit),
-                rows=means is None,
-                timed=columns.time is not None,
-            )
-        )
+        place = partial(left_row, table.where, zeros.rows) if zeros.count or window else table.where
+        if means is not None:
+            place = _Labels(dict(enumerate(label for _, label in means.index)))
+        read = rows_read if window is None else window.total
+        form = InputForm(table.source_format, read, table.rows_skipped, None, columns.unit)
+        sha256 = table.sha256 if window is None else window.sha256
+        ways = {"rows": means is None, "timed": columns.time is not None}
+        notes = notes_of(table, columns)
+        self.origins.append(TableOrigin(table.name, sha256, columns.names, first, place, notes, form, **ways))
+
+    def _coded(
+        self, table: InputTable, columns: Columns, name: str | None, window: Window | None
+    ) -> Iterator[tuple[RowBlock, Int]]:
+        """Yield the rows of a table, none empty, with the numbers of their sensors, shape (B,)."""
+        selection = columns.selection()
+        if window is None:
+            for rows in table.blocks(selection):
+                if len(rows.numbers):
+                    labels = rows.texts[0] if name is None else _only(table, columns, rows, name)
+                    yield rows, number_labels(self.index, labels)
+            return
+        codes = np.repeat(number_labels(self.index, window.sensors), window.rows)
+        table.window = (window.first, window.first + len(codes))  # type: ignore[attr-defined]  # a typed table has one
+        for rows in table.blocks(replace(selection, texts=selection.texts[1:])):
+            start = rows.start - window.first
+            yield rows, codes[start : start + len(rows.numbers)]
 
     def _note_zeros(self, idle: dict[int, list[int]], where: Callable[[int], str]) -> None:
         """Note the rows of zeros of each sensor; one that has nothing else keeps them."""
@@ -392,6 +543,9 @@ class _FleetCollector:
     ) -> None:
         """Add poses: the numbers of their sensors (B,), output (B, 3), and what is known of the extras."""
         before = self.store.rows
+        if len(codes):
+            self.in_order &= bool(codes[0] >= self._last and (codes[1:] >= codes[:-1]).all())
+            self._last = int(codes[-1])
         self.poses = np.pad(self.poses, (0, len(self.index) - len(self.poses)))
         self.poses += np.bincount(codes, minlength=len(self.poses))
         self.store.append(np.column_stack([codes, output]))
@@ -406,10 +560,9 @@ class _FleetCollector:
         self.extras.append(rows)
 
 
-def _set_aside(idle: dict[int, list[int]], codes: Int, keep: Bool, start: int) -> None:
-    """Add the rows that are not kept, from `start` on, to those of their sensors, by its number."""
-    for row in np.flatnonzero(~keep).tolist():
-        idle.setdefault(int(codes[row]), []).append(start + row)
+def notes_of(table: InputTable, columns: Columns) -> tuple[str, ...]:
+    """Return what there is to say of a table and its columns."""
+    return (*table.notes, *columns.notes, *(() if columns.temperature is None else (COLD,)))
 
 
 def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> list[str]:
@@ -423,9 +576,15 @@ def _only(table: InputTable, columns: Columns, rows: RowBlock, name: str) -> lis
     return [name] * len(rows.numbers)
 
 
-def _past_zeros(where: Callable[[int], str], zeros: ZeroRows) -> Callable[[int], str]:
-    return lambda pose: where(zeros.rows.line(pose))
+@dataclass(frozen=True)
+class _Labels:
+    """The names of poses by their labels."""
 
+    names: dict[int, str]
 
-def _by_label(labels: list[str]) -> Callable[[int], str]:
-    return lambda pose: f'position "{labels[pose]}"'
+    def __call__(self, pose: int) -> str:
+        return f'position "{self.names[pose]}"'
+
+    def only(self, poses: Sequence[int]) -> _Labels:
+        """Return those of some poses."""
+        return _Labels({pose: self.names[pose] for pose in poses})

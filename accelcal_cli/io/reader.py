@@ -11,7 +11,7 @@ import math
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
@@ -32,7 +32,7 @@ from accelcal_cli.io.dialect import (
     to_number,
     understand,
 )
-from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
+from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter, kept_line
 from accelcal_cli.io.stream import LONGEST_LINE, TYPED, ByteSource, Source, open_source
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
@@ -295,8 +295,7 @@ class TextTable:
         """Line of a row that has been read."""
         if self.filter is None:
             return self._lines.where
-        lines, kept = self._lines, self.filter.lines
-        return lambda row: f"line {kept.line(lines.line(row))}"
+        return partial(kept_line, self._lines, self.filter.lines)
 
     def close(self) -> None:
         """Release the file."""

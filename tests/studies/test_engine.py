@@ -16,9 +16,10 @@ from pathlib import Path
 
 import pytest
 
+from accelcal_cli import pools
 from accelcal_cli.errors import DataError, OutputError
 from accelcal_cli.output.machine import write_table
-from accelcal_cli.studies import engine, pools
+from accelcal_cli.studies import engine
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.study import Entry, Task
