@@ -265,7 +265,7 @@ def command(
         notes = [*found.notes, *_told(whole, raw)]
     bad = _bad(shown.fleet, tolerance)
     if shown.check is not None:
-        bad["beyond the limits"] = ~shown.check.passed
+        bad["beyond the limits or without a value"] = ~shown.check.passed
     with process.even_if_unread(sys.stderr):
         options.tell(notes, quiet)
         options.tell_assumed_gravity(stated_g, settings.g, quiet)
