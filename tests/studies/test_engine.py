@@ -6,10 +6,12 @@ import errno
 import json
 import os
 import signal
+import socket
 import sys
 from functools import partial
 from multiprocessing import active_children
 from pathlib import Path
+from threading import Thread
 
 import pytest
 from programs import group, program, until
@@ -131,6 +133,36 @@ def test_a_cluster_that_does_not_answer(monkeypatch):
         pytest.raises(DataError, match="no Dask scheduler answers there"),
         pools.cluster("tcp://127.0.0.1:9"),
     ):
+        pass
+
+
+@pytest.mark.parametrize("greeting", [b"", b"SSH-2.0-OpenSSH_9.6\r\n", b"cut"])
+def test_the_port_of_another_server(monkeypatch, greeting):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(pools, "ANSWER_TIME", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            client, _ = server.accept()
+            with client:
+                client.sendall(greeting)
+                client.recv(1) if not greeting else None
+
+        thread = Thread(target=answer)
+        thread.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            pytest.raises(DataError, match=r"no Dask scheduler|another server") as refused,
+            pools.cluster(address),
+        ):
+            pass
+        thread.join()
+    assert "\n" not in str(refused.value)
+
+
+def test_tls_without_certificates():
+    pytest.importorskip("distributed")
+    with pytest.raises(DataError, match=r"tls:// needs certificates"), pools.cluster("tls://127.0.0.1:8786"):
         pass
 
 
