@@ -397,14 +397,14 @@ def standouts(fleet: Fleet, g: float) -> list[Standout]:
     found = []
     shared = _shared_variance(fleet)
     pose = np.fmax(fleet.s[known], np.sqrt(shared))  # few poses estimate it too small at times
-    gains = parameter_gains(fleet, g)[known]
     for p, name in enumerate(PARAMETERS):
         values = fleet.parameters[known, p]
         middle = float(np.median(values))
         spread = NORMAL_MAD * float(np.median(np.abs(values - middle)))
         if spread <= 1e-9 * float(np.abs(values).max()):
             continue  # all alike, but for rounding
-        own = (pose * gains[:, p]) ** 2
+        gain = fleet.gain[known, p] * _units(g)[p] * (values if name in PARAMETERS[SCALE] else 1.0)
+        own = (pose * gain) ** 2
         z = (values - middle) / np.sqrt(spread**2 + np.maximum(own - np.median(own), 0.0))
         far = np.flatnonzero(np.abs(z) > 3.0)
         freedom = np.full(len(far), min(MOST_FREEDOM, int(EFFICIENCY * len(known))))

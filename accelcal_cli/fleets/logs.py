@@ -34,6 +34,9 @@ from accelcal_cli.io.reader import PLAIN, ReadOptions
 TOGETHER, BLOCKS = 16, 64
 """Most logs of a block, and the blocks from which on they have more than one."""
 
+MANY = 16
+"""Logs from which on reading short texts with polars makes up for loading it."""
+
 
 @dataclass(frozen=True)
 class LogForm:
@@ -158,6 +161,8 @@ def supply_logs(sources: Sequence[str], form: LogForm, gravity: Gravity) -> Supp
     """
     files, _ = expanded(sources)
     names, size = file_names(files), max(1, min(TOGETHER, len(files) // BLOCKS))
+    if len(files) >= MANY:
+        form = replace(form, options=replace(form.options, many=True))
     starts = range(0, len(files), size)
 
     def blocks(done: frozenset[int]) -> Iterator[tuple[int, Block]]:
