@@ -80,7 +80,7 @@ def calibrate_many(
         >>> [result.verdict for result in results]
         ['good', 'good']
     """
-    readings = [read_readings(one, columns) for one in data]
+    readings = [one if isinstance(one, Readings) else read_readings(one, columns) for one in data]
     if settings is not None and not keys:
         return _calibrated(readings, settings)
     results: dict[int, Calibration] = {}

@@ -480,7 +480,7 @@ def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:
 
     Under a robust loss the factor of (J^T W J)^-1 in the covariance of the M-estimate [huber1981] eq. 7.6.5 and 7.6.8:
     K^2 sum psi^2 / (J - p) / (mean psi')^2 with K = 1 + p / J var psi' / (mean psi')^2, W the weights of the poses
-    without those of the loss.
+    without those of the loss. Of few poses that is too small: by about 1 / (J - p) for normal and for t3 residuals.
     """
     room = np.where(freedom > 0, freedom, np.nan)
     if _robust(solution) is None:
@@ -489,7 +489,7 @@ def _variance(solution: Solution, sums: Float, freedom: Int) -> Float:
     mean = sums[4] / poses
     unequal = np.maximum(sums[5] / poses / mean**2 - 1.0, 0.0)
     K = 1.0 + (poses - freedom) / poses * unequal
-    return np.asarray(K**2 * sums[3] / room / mean**2)
+    return np.asarray((1.0 + 1.0 / room) * K**2 * sums[3] / room / mean**2)
 
 
 def uncalibrated(scale: Float, D: Float, settings: Settings) -> tuple[Float, Float, list[str]]:

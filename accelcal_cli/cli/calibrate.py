@@ -15,6 +15,8 @@ from accelcal_cli.errors import UsageError
 from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
     from accelcal_cli.views.blocks import Block, Table
@@ -241,17 +243,18 @@ def _show(result: Calibration, format: str, output: str | None, *, verbose: bool
 
         return values(result)
 
-    def shown() -> list[Block]:
-        if verbose:
-            from accelcal_cli.views.calibration import blocks
+    shown: Callable[[], list[Block]]
+    if verbose:
+        from accelcal_cli.views.calibration import blocks
 
-            return blocks(result)
+        shown = partial(blocks, result)
+    elif result.worn is None:
         from accelcal_cli.views.quoted import screen
 
-        if result.worn is None:
-            return screen(result)
+        shown = partial(screen, result)
+    else:
         from accelcal_cli.views.calibration import worn
+        from accelcal_cli.views.quoted import screen
 
-        return screen(result, worn(result.worn))
-
+        shown = partial(screen, result, worn(result.worn))
     options.print_result(format, table, shown, result.record)

@@ -194,6 +194,8 @@ class GravityOptions:
 
     def in_unit(self, unit: str | None) -> float | None:
         """Return the stated local gravity in the unit of the readings, see `local_gravity`."""
+        if unit is None and all(value is None for value in vars(self).values()):
+            return None
         from accelcal_cli.sensor.model import local_gravity
 
         return local_gravity(unit, **vars(self))

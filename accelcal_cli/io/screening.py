@@ -28,6 +28,7 @@ from accelcal_cli.io.ties import (
     grid_step,
     is_stepped,
     quadric_terms,
+    quantile,
     unscattered,
 )
 from accelcal_cli.notices import COMMAND, Notice
@@ -397,7 +398,8 @@ class Screened:
             return
         poses = np.sqrt((self.scatter**2).mean(axis=1) / self.count)
         for what, noise in (("poses", poses), ("axes", self._usual_scatter)):
-            low, high = np.quantile(noise, [0.1, 0.9]) if len(noise) > 3 else (noise.min(), noise.max())
+            ends = (0.1, 0.9) if len(noise) > 3 else (0.0, 1.0)
+            low, high = (quantile(noise, end) for end in ends)
             if high > UNEQUAL * low > 0:
                 text = f"The noise of the {what} differs by a factor of {high / low:.2g}; sigma counts that."
                 yield Notice(

@@ -424,16 +424,30 @@ def greatest_step(values: Float) -> float:
     """Return the greatest step that readings of an axis in time may have, inf where they do not change often enough."""
     change = np.abs(np.diff(values))
     change = change[change > 0]
-    return float(np.quantile(change, 0.25)) if len(change) > 0.1 * len(values) else math.inf
+    return quantile(change, 0.25) if len(change) > 0.1 * len(values) else math.inf
+
+
+def quantile(values: Float, part: float) -> float:
+    """Return a quantile, as `numpy.quantile` does, which imports numpy.ma: a tenth of the time of a start."""
+    ordered, at = np.sort(values), part * (len(values) - 1)
+    low = int(at)
+    high = min(low + 1, len(ordered) - 1)
+    return float(ordered[low] + (at - low) * (ordered[high] - ordered[low]))
+
+
+def _gaps(values: Float) -> Float:
+    """Return the differences between neighbours among the distinct values."""
+    gaps = np.diff(np.sort(values))
+    return np.asarray(gaps[gaps > 0])
 
 
 def is_stepped(values: Float, step: float) -> bool:
     """Return whether readings come in such steps: no two of them differ by much less."""
-    gaps = np.diff(np.unique(values))
+    gaps = _gaps(values)
     return bool(step > 0 and len(gaps) and gaps.min() > 0.5 * step)
 
 
 def coarsest_step(values: Float) -> float:
     """Return the step that readings of an axis in time seem to have: the least difference where they seldom change."""
-    step, gaps = greatest_step(values), np.diff(np.unique(values))
+    step, gaps = greatest_step(values), _gaps(values)
     return step if step < math.inf else float(gaps.min(initial=math.inf)) if len(gaps) else 0.0

@@ -70,7 +70,9 @@ def poses_table(detection: Detection) -> Table:
         *(Column(f"s{axis}", format=".3g") for axis in "xyz"),
     ]
     rows = (
-        np.column_stack([np.arange(1, len(poses) + 1), poses.start, poses.end, poses.n]).astype(int).tolist()
+        np.column_stack([np.arange(1, len(poses.n) + 1), poses.start, poses.end, poses.n])
+        .astype(int)
+        .tolist()
     )
     values = [poses.mean, poses.scatter]
     if poses.time is not None:

@@ -368,6 +368,23 @@ def test_a_robust_loss_minimises_its_loss(robust):
     assert (np.abs(gradient) < 1e-4 * size).all()
 
 
+@pytest.mark.parametrize("robust", ["huber", "soft-l1"])
+def test_the_noise_under_a_robust_loss_is_that_of_its_estimate(robust):
+    """s^2 is Huber's factor of (J^T J)^-1, written out, and a fifteenth more: 24 poses leave fifteen of freedom."""
+    data = readings(poses.turns(), sigma=1e-3, seed=2)
+    result = calibrate(data, _fast(robust=robust))
+    f = result.model.specific_force(data.output())
+    e = (G**2 - (f**2).sum(axis=1)) / (2 * G)
+    noise = 1.4826 * np.median(np.abs(e)) / np.sqrt(15 / 24)
+    z = e / noise
+    psi = np.clip(z, -1.345, 1.345) if robust == "huber" else z / np.sqrt(1 + z * z)
+    slope = (np.abs(z) < 1.345).astype(float) if robust == "huber" else (1 + z * z) ** -1.5
+    K = 1 + 9 / 24 * slope.var() / slope.mean() ** 2
+    s2 = K**2 * noise**2 * (psi**2).sum() / 15 / slope.mean() ** 2
+    assert result.outliers == ()
+    assert result.s**2 == pytest.approx(16 / 15 * s2, rel=1e-6)
+
+
 def test_a_robust_loss_on_perfect_readings_changes_nothing():
     result = calibrate(readings(poses.turns()), _fast(robust="huber"))
     _close(result, DPSO, 1e-10)
