@@ -189,7 +189,7 @@ def command(
     limits: Annotated[
         Path | None,
         options.in_output(
-            help="YAML file of limits, as limits: {bias: 50 mg, scale: 1 %}; exit 1 when a sensor is beyond one.",
+            help="YAML file of limits per parameter, as bias: 50 mg; exit 1 when a sensor is beyond one.",
             metavar="FILE",
         ),
     ] = None,
