@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -24,3 +27,37 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the real recordings are not beside the project")
     return SHARED
+
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """The address of a Dask scheduler with two workers, processes of their own on this machine."""
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    port = address.rpartition(":")[2]
+    quiet = {"PYTHONWARNINGS": "default"}
+    commands = [
+        ["scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"],
+        *[["worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny"]] * 2,
+    ]
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, **quiet, "PYTHONPATH": path}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *command],
+            cwd=tmp_path,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for command in commands
+    ]
+    yield address, processes
+    for process in processes:
+        process.kill()
+        process.wait()

@@ -10,12 +10,12 @@ from pathlib import Path
 PACKAGE = "accelcal_cli"
 
 GROUPS = (
-    ("errors", "notices", "arrays", "rng", "schema", "registry", "config"),
+    ("errors", "notices", "arrays", "rng", "schema", "registry", "config", "pools"),
     ("optimization", "sensor"),
     ("io",),
     ("calibration",),
     ("detection", "planning", "verification", "exporters"),
-    ("studies",),
+    ("studies", "fleets"),
     ("navigation",),
     ("views",),
     ("output",),

@@ -29,7 +29,8 @@ from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.sample import NO_NOISE, NORMAL_MAD, Sample
 from accelcal_cli.calibration.settings import Settings, load_settings
 from accelcal_cli.errors import ConfigError, DataError
-from accelcal_cli.io.fleet import FleetReadings, read_fleet
+from accelcal_cli.io.batches import FleetReadings
+from accelcal_cli.io.fleet import read_fleet
 from accelcal_cli.io.readings import Data, Readings, read_readings
 from accelcal_cli.io.stream import Source, is_frame
 from accelcal_cli.sensor import model as units
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
 
 FAILED = "failed"
 """Verdict on a sensor that cannot be calibrated: a single pose, all of them equal, or weights that it does not give."""
+
+UNWEIGHTED = "--weights"
+"""Where the reason of a sensor begins that does not give the weights asked for."""
 
 NAMED = 3
 """Outlying poses of a sensor that are named one by one."""
@@ -240,6 +244,19 @@ def calibrate_fleet(
         ConfigError: settings that are not for a fleet.
         DataError: not one sensor gives the weights asked for.
     """
+    fleet = calibrate_part(readings, settings, keep)
+    if all(reason.startswith(UNWEIGHTED) for reason in fleet.reason):
+        label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
+        raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
+    return fleet
+
+
+def calibrate_part(
+    readings: FleetReadings,
+    settings: Settings,
+    keep: Callable[[int, Calibration], None] | None = None,
+) -> Fleet:
+    """Calibrate the sensors of a part of a fleet; as `calibrate_fleet`, but no sensor need give the weights."""
     check_settings(settings)
     parts = []
     for batch in readings.batches():
@@ -262,11 +279,7 @@ def calibrate_fleet(
             if keep is not None:
                 for place, number in enumerate(numbers[at].tolist()):
                     keep(number, dated(record(assessment, place)))
-    fleet = _joined(parts)
-    if all(reason.startswith("--weights") for reason in fleet.reason):
-        label, reason = readings.sensors[fleet.number[0]], fleet.reason[0].rstrip(".")
-        raise DataError(f'{readings.source}: sensor "{label}", as all others: {reason}')
-    return fleet
+    return _joined(parts)
 
 
 def _is_closed(settings: Settings) -> bool:
@@ -422,7 +435,7 @@ def _units(g: float) -> Float:
     return np.repeat([1.0, units.MRAD, units.MICRO_G / g], 3)
 
 
-def _gains(fleet: Fleet, g: float) -> Float:
+def parameter_gains(fleet: Fleet, g: float) -> Float:
     """Return the errors of `Fleet.parameters` over the noise of a pose in m/s^2, shape (R, 9)."""
     gains = fleet.gain * _units(g)
     gains[:, SCALE] *= fleet.parameters[:, SCALE]
@@ -443,14 +456,14 @@ def standouts(fleet: Fleet, g: float) -> list[Standout]:
     found = []
     shared = _shared_variance(fleet)
     pose = np.fmax(fleet.s[known], np.sqrt(shared))  # few poses estimate it too small at times
-    gains = _gains(fleet, g)[known]
     for p, name in enumerate(PARAMETERS):
         values = fleet.parameters[known, p]
         middle = float(np.median(values))
         spread = NORMAL_MAD * float(np.median(np.abs(values - middle)))
         if spread <= 1e-9 * float(np.abs(values).max()):
             continue  # all alike, but for rounding
-        own = (pose * gains[:, p]) ** 2
+        gain = fleet.gain[known, p] * _units(g)[p] * (values if name in PARAMETERS[SCALE] else 1.0)
+        own = (pose * gain) ** 2
         z = (values - middle) / np.sqrt(spread**2 + np.maximum(own - np.median(own), 0.0))
         far = np.flatnonzero(np.abs(z) > 3.0)
         freedom = np.full(len(far), min(MOST_FREEDOM, int(EFFICIENCY * len(known))))

@@ -408,7 +408,7 @@ def _satterthwaite(v: Float, w: Float, rows: Float, cofactor: Float, leverage: F
     B = (rows * (w * v)[..., None]).swapaxes(1, 2) @ rows
     CB = cofactor @ B
     square = np.sum(v * v * (1.0 - 2.0 * leverage), axis=1) + np.einsum("rpq,rqp->r", CB, CB)
-    return np.maximum(np.sum(v * (1.0 - leverage), axis=1) ** 2 / np.maximum(square, 1e-300), 1.0)
+    return np.asarray(np.maximum(np.sum(v * (1.0 - leverage), axis=1) ** 2 / np.maximum(square, 1e-300), 1.0))
 
 
 def noise_bias(u: Float, w: Float, covariance: Float, cofactor: Float, g: float) -> Float:

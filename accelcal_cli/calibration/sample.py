@@ -18,7 +18,7 @@ from accelcal_cli.schema import frozen
 from accelcal_cli.sensor.poses import AXES
 
 if TYPE_CHECKING:
-    from accelcal_cli.io.fleet import Batch, FleetReadings
+    from accelcal_cli.io.batches import Batch, FleetReadings
 
 Blocks = Callable[[], Iterator[tuple[int, Float]]]
 """Yields (number of the first pose, outputs, shape (R, B, 3)) from the first pose on, as often as it is called."""

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from accelcal_cli.cli import meta as metadata
-from accelcal_cli.cli import options, process, wear
-from accelcal_cli.errors import AccelcalError, UsageError
+from accelcal_cli.cli import options, process, running, wear
+from accelcal_cli.errors import AccelcalError, Interrupted, UsageError
+from accelcal_cli.schema import frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from accelcal_cli.arrays import Bool
     from accelcal_cli.calibration.fleet import Fleet
     from accelcal_cli.calibration.result import Calibration
     from accelcal_cli.calibration.settings import Settings
-    from accelcal_cli.detection.detect import Detection
-    from accelcal_cli.detection.worn import Wear
-    from accelcal_cli.io.readings import Readings
+    from accelcal_cli.fleets.blocks import Supply, Work
+    from accelcal_cli.fleets.limits import Limit
+    from accelcal_cli.fleets.logs import LogForm
+    from accelcal_cli.fleets.run import Executors, Finished, Whole
+    from accelcal_cli.views.blocks import Block, Table
 
 SUFFIXES = (".csv", ".parquet", ".json")
 NAMED = 5
@@ -33,8 +37,129 @@ NAMED = 5
 MOST_NOTES = 10
 """Notes on the logs of a fleet that are told."""
 
-
 in_model = options.panel("Model")
+
+
+@frozen()
+class FleetRunOptions:
+    """Where the blocks of a fleet are calibrated, and whether an interrupted run is continued."""
+
+    jobs: Annotated[
+        int,
+        running.in_runs(
+            "--jobs", "-j", help="Processes on this machine.", min=1, max=running.MOST_JOBS, metavar="N"
+        ),
+    ] = 1
+    cluster: Annotated[
+        str | None,
+        running.in_runs("--cluster", help="Run on a Dask cluster: tcp://host:8786.", metavar="ADDRESS"),
+    ] = None
+    resume: Annotated[
+        bool,
+        running.in_runs(
+            "--resume",
+            help="Go on with an interrupted run; its blocks are in OUTPUT.journal, beside the -o OUTPUT.",
+        ),
+    ] = False
+
+    def check(self, output: str | None) -> None:
+        """Refuse options that do not go together, and to begin anew what can be gone on with.
+
+        Raises:
+            UsageError: --resume without -o, or --jobs beside --cluster. DataError: an interrupted run left its blocks.
+        """
+        if self.resume and output is None:
+            raise UsageError("--resume needs the -o OUTPUT of the interrupted run")
+        if self.cluster is not None and self.jobs != 1:
+            raise UsageError("--jobs and --cluster: expected one of them, not both")
+        if output is not None and not self.resume and (journal := _journal(output)).exists():
+            from accelcal_cli.fleets.run import interrupted_run
+
+            raise interrupted_run(journal)
+
+    @contextmanager
+    def whole(
+        self, supply: Supply, work: Work, output: str | None, quiet: bool, what: str
+    ) -> Iterator[Whole]:
+        """Calibrate the blocks of a fleet; they are kept until the output is written.
+
+        Result files of the sensors, where `work` makes them, are in the folder `output` when this has ended.
+        """
+        from accelcal_cli.fleets.run import Whole, run_blocks
+        from accelcal_cli.output.files import publish_folder, whole_folder
+        from accelcal_cli.output.machine import remove_results, write_result
+
+        parts = self._parts(supply, work, output)
+        try:
+            with ExitStack() as stack:
+                results = parts.results
+                if work.text is not None and results is None and output is not None:
+                    results = stack.enter_context(whole_folder(output))
+                write = None if results is None or work.text is None else partial(write_result, results)
+                with running.progress_bar(quiet, what) as progress:
+                    run_blocks(supply, work, parts, self._executors(supply), progress=progress, write=write)
+                whole = Whole(parts, work)
+                if work.text is not None and results is not None:
+                    remove_results(results, whole.other_units())
+                yield whole
+            if work.text is not None and parts.results is not None and output is not None:
+                publish_folder(parts.results, output)
+        except KeyboardInterrupt as stop:
+            ending = process.interrupted(stop)
+            raise Interrupted(f"{ending}{parts.kept()}", ending.code) from None
+        except AccelcalError as error:
+            raise type(error)(f"{error}{parts.kept()}") from None
+        finally:
+            parts.leave()
+        parts.remove()
+
+    def _parts(self, supply: Supply, work: Work, output: str | None) -> Finished:
+        """Return where finished blocks are kept: beside the output, where there is more than one block."""
+        from accelcal_cli.fleets.run import Finished, identity_of
+
+        if supply.count < 2:
+            return Finished()
+        if output is None:
+            return Finished.temporary()
+        return Finished.open(_journal(output), identity_of(supply, work), self.resume)
+
+    def _executors(self, supply: Supply) -> Executors | None:
+        useful = 1 if supply.once else min(self.jobs, supply.count)
+        if self.cluster is None and useful < 2:
+            return None
+        import accelcal_cli.pools as pools
+
+        return (
+            partial(pools.local_pool, useful)
+            if self.cluster is None
+            else partial(pools.cluster, self.cluster)
+        )
+
+
+@dataclass(frozen=True)
+class _ResultFile:
+    """Makes the text of the result file of a sensor, with what its calibration does not know.
+
+    Attributes:
+        meta: what is stated of it; filed_g: where the file of settings states g, or nothing; gravity: as stated.
+        date: of the run, so that a file does not depend on when its block was made.
+    """
+
+    meta: Mapping[str, str]
+    filed_g: str
+    gravity: options.GravityOptions
+    date: str = field(repr=False)
+
+    def __call__(self, one: Calibration) -> str:
+        from accelcal_cli.output.machine import result_line
+
+        source = self.filed_g or self.gravity.source(one.data.get("unit"))
+        return result_line(replace(one, meta=dict(self.meta), g_source=source, date=self.date))
+
+
+def _journal(output: str) -> Path:
+    """Return the folder that keeps the finished blocks of a run."""
+    return Path(f"{output.rstrip('/')}.journal")
 
 
 def command(
@@ -43,7 +168,7 @@ def command(
         list[str],
         typer.Argument(
             help="Table of static readings with a column that labels the sensor, or one file per sensor; with --raw "
-            "logs; text, Parquet, Arrow or native; - is standard input.",
+            "logs; text, Parquet, Arrow or native; a folder of Parquet files; - is standard input.",
             rich_help_panel="Input",
         ),
     ],
@@ -109,6 +234,14 @@ def command(
     ] = False,
     worn: wear.Worn = False,
     log: options.DetectionOptions,
+    runs: FleetRunOptions,
+    limits: Annotated[
+        Path | None,
+        options.in_output(
+            help="YAML file of limits per parameter, as bias: 50 mg; exit 1 when a sensor is beyond one.",
+            metavar="FILE",
+        ),
+    ] = None,
     tolerance: Annotated[
         float | None,
         options.in_output(
@@ -133,19 +266,20 @@ def command(
 
     Every sensor as `calibrate --optimizer levenberg-marquardt` would by itself. Prints which sensors are not good,
     which stand out and how the fleet spreads; --format csv or json prints a row for each.
-    Exit code 1 means that a sensor is suspect, undetermined or failed, or missed the --tolerance.
+    Exit code 1 means that a sensor is suspect, undetermined or failed, or missed the --tolerance or the --limits.
     """
-    from accelcal_cli.calibration.fleet import calibrate_each, calibrate_fleet, check_settings
+    from accelcal_cli.calibration.calibrate import moment
+    from accelcal_cli.calibration.fleet import check_settings
     from accelcal_cli.calibration.settings import load_settings, weights_of_log
     from accelcal_cli.config import load_mapping
-    from accelcal_cli.io.fleet import COLD, read_fleet
-    from accelcal_cli.output.files import whole_folder
-    from accelcal_cli.output.machine import write_result
+    from accelcal_cli.fleets.blocks import Gravity, Work, supply
+    from accelcal_cli.io.fleet import COLD
 
     for source in data:
         options.check_input(source)
-    options.check_apart([*data, config], {"-o": output})
+    options.check_apart([*data, config, limits], {"-o": output})
     folder = output is not None and _check_output(output)
+    runs.check(output)
     kept = metadata.stated(meta) if meta else {}
     if kept and not folder:
         raise UsageError("--meta is kept in result files: add -o FOLDER/")
@@ -171,163 +305,82 @@ def command(
         stated.setdefault("temperature", False)
     settings = load_settings(config, stated)
     check_settings(settings, each=raw)
-
-    def local_g(unit: str | None) -> float:
-        own = gravity.in_unit(unit)
-        return settings.g if own is None or (stated_g is None and "g" in filed) else own
-
+    bounds = _load_limits(limits, settings)
     filed_g = f"stated in {config.name}" if config and stated_g is None and "g" in filed else ""
-    labels: Sequence[str]
-    run: Callable[[Settings, Callable[[int, Calibration], None] | None], Fleet]
+    text = _ResultFile(kept, filed_g, gravity, moment()) if folder else None
+    work = Work(settings, Gravity(vars(gravity), settings.g, "g" in filed), text)
     if raw:
-        logs = _Logs(columns, form, log, local_g, worn, settings.temperature)
-        logs.read(data, sensor_column)
-        labels, notes, run = logs.labels, logs.told(), partial(calibrate_each, logs.readings)
-        g = logs.g or settings.g
-    else:
-        readings = read_fleet(
-            data,
-            options.split_columns(columns),
-            sensor_column,
-            stdin=sys.stdin.buffer,
-            options=form.read_options(),
-        )
-        notes = list(dict.fromkeys(note for origin in readings.origins for note in origin.notes))
-        notes += [COLD] if readings.warm and not settings.temperature else []
-        labels, g, run = readings.sensors, local_g(readings.unit), partial(calibrate_fleet, readings)
-    settings = replace(settings, g=g)
-    if folder and output is not None:
-        with whole_folder(output) as results:
+        from accelcal_cli.fleets.logs import supply_logs
 
-            def keep(number: int, one: Calibration) -> None:
-                source = filed_g or gravity.source(one.data.get("unit"))
-                write_result(results, labels[number], replace(one, meta=kept, g_source=source))
-
-            fleet = run(settings, keep)
+        found = supply_logs(data, _log_form(columns, form, log, sensor_column, worn, settings), work.gravity)
     else:
-        fleet = run(settings, None)
-    with process.even_if_unread():
-        _show(fleet, labels, settings, format, None if folder else output, verbose=verbose)
-    bad = _bad(fleet, tolerance)
+        read = form.read_options()
+        named = options.split_columns(columns)
+        found = supply(data, work, named, sensor_column, stdin=sys.stdin.buffer, options=read)
+    with runs.whole(found, work, output, quiet, "logs" if raw else "sensors") as whole:
+        settings = replace(settings, g=whole.g or settings.g)
+        shown = _Shown(whole, settings, bounds)
+        if output is not None and not folder:
+            shown.write(output)
+        with process.even_if_unread():
+            shown.show(format, verbose)
+        notes = [*found.notes, *_told(whole, raw)]
+        if settings.temperature:
+            notes = [note for note in notes if not note.startswith(COLD)]
+    bad = _bad(shown.fleet, tolerance)
+    if shown.check is not None:
+        bad["beyond the limits or without a value"] = ~shown.check.passed
     with process.even_if_unread(sys.stderr):
         options.tell(notes, quiet)
         options.tell_assumed_gravity(stated_g, settings.g, quiet)
         options.tell_written([output], quiet)
-        _name(bad, labels)
+        _name(bad, shown.labels)
     if any(which.any() for which in bad.values()):
         raise typer.Exit(options.BAD_VERDICT)
 
 
-@dataclass
-class _Logs:
-    """The raw logs of a fleet, detected one after the other.
+def _load_limits(path: Path | None, settings: Settings) -> Mapping[str, Limit] | None:
+    if path is None:
+        return None
+    from accelcal_cli.fleets.limits import load_limits
 
-    Attributes:
-        columns, form, log, local_g: see `options.DetectionOptions.detect`.
-        worn: they are of days of wear; slopes: with temperature are fitted.
-        labels: of the sensors; readings: the static poses of each, or why there are none.
-        gravities: local gravity in the unit of each that has poses, by its number; g: in that of most of them.
-        notes: what there is to say of logs, and of how many.
-    """
+    return load_limits(path, settings)
 
-    columns: str | None
-    form: options.TextOptions
-    log: options.DetectionOptions
-    local_g: Callable[[str | None], float]
-    worn: bool = False
-    slopes: bool = True
-    labels: list[str] = field(default_factory=list)
-    readings: list[Readings | str] = field(default_factory=list)
-    gravities: dict[int, float] = field(default_factory=dict)
-    g: float | None = None
-    notes: Counter[str] = field(default_factory=Counter)
 
-    def read(self, sources: Sequence[str], sensor: str | None) -> None:
-        """Find the static poses of all sensors; a log that is broken or too poor does not stop the others.
+def _log_form(
+    columns: str | None,
+    form: options.TextOptions,
+    log: options.DetectionOptions,
+    sensor: str | None,
+    worn: bool,
+    settings: Settings,
+) -> LogForm:
+    """Return the options of raw logs as the library takes them; they are refused before a file is read."""
+    from accelcal_cli.fleets.logs import LogForm
 
-        Raises:
-            UsageError: a file twice, or options that fit no log.
-        """
-        from accelcal_cli.io.fleet import check_once, file_names
+    named, gyro = options.split_columns(columns), options.split_columns(log.gyro)
+    return LogForm(
+        None if named is None else tuple(named),
+        None if gyro is None else tuple(gyro),
+        log.time,
+        form.read_options(),
+        log.settings(1.0),
+        wear.settings(log, misalignment=True, slopes=settings.temperature) if worn else None,
+        sensor,
+    )
 
-        check_once(sources)
-        faults: list[AccelcalError] = []
-        for source, name in zip(sources, file_names(sources), strict=True):
-            try:
-                parts = self._parts(source, name, sensor, alone=len(sources) == 1)
-            except AccelcalError as error:
-                self._add(name, source, error)
-                faults.append(error)
-                continue
-            for label, form in parts:
-                try:
-                    self._add(label, source, self._found(source, form))
-                except AccelcalError as error:
-                    self._add(label, source, error)
-                    faults.append(error)
-        if len(faults) == len(self.labels) and all(isinstance(error, UsageError) for error in faults):
-            raise faults[0]
-        self._leave_out_other_units()
 
-    def _found(self, source: str, form: options.TextOptions) -> Detection | Wear:
-        """Find the static poses of a log."""
-        if not self.worn:
-            return self.log.detect(source, self.columns, self.local_g, form)
-        return wear.find(
-            source, self.columns, self.log, self.local_g, form, misalignment=True, slopes=self.slopes
-        )
-
-    def told(self) -> list[str]:
-        """Return the notes, each once with the number of its logs where there are several."""
-        of = len(self.labels)
-        told = [
-            f"{note} ({n:,} of {of:,} logs)" if of > 1 else note
-            for note, n in self.notes.most_common(MOST_NOTES)
-        ]
-        more = len(self.notes) - len(told)
-        return [*told, *([f"and {more:,} more notes (in the result files of -o FOLDER/)"] if more else [])]
-
-    def _parts(
-        self, source: str, name: str, sensor: str | None, *, alone: bool
-    ) -> list[tuple[str, options.TextOptions]]:
-        """Return the sensors of a log, and the rows to read of each: of several files each is one, unless told."""
-        from accelcal_cli.detection.rawlog import sensors_of
-
-        if sensor is None and (source == "-" or not alone):
-            return [(name, self.form)]
-        if source == "-":
-            raise UsageError(
-                "-: standard input is read once; --sensor-column with --raw needs the name of a file"
-            )
-        found = sensors_of(source, sensor, options=self.form.read_options())
-        if sensor is None and len(found) < 2:
-            return [(name, self.form)]
-        stated = self.form.where or []
-        return [
-            (label if alone else f"{name}/{label}", replace(self.form, where=[*stated, condition]))
-            for label, condition in found
-        ]
-
-    def _add(self, label: str, source: str, found: Detection | Wear | AccelcalError) -> None:
-        """Add a sensor: its poses, or why there are none."""
-        self.labels.append(label)
-        if isinstance(found, AccelcalError):
-            self.readings.append(str(found).removeprefix(source).lstrip(":, ").rstrip("."))
-            return
-        self.readings.append(found.readings())
-        self.gravities[len(self.readings) - 1] = found.settings.g
-        self.notes.update(found.notes)
-
-    def _leave_out_other_units(self) -> None:
-        """Leave out sensors whose readings are in another unit than those of most: they cannot be compared."""
-        if not self.gravities:
-            return
-        ((self.g, _),) = Counter(self.gravities.values()).most_common(1)
-        for at, own in self.gravities.items():
-            if own != self.g:
-                self.readings[at] = (
-                    f"1 g is {own:g} in the unit of its readings, and {self.g:g} in that of most logs"
-                )
+def _told(whole: Whole, raw: bool) -> list[str]:
+    """Return the notes on files, those on logs each with the number of its logs where there are several."""
+    if not raw:
+        return list(whole.notes)
+    of = len(whole)
+    told = [
+        f"{note} ({n:,} of {of:,} logs)" if of > 1 else note
+        for note, n in whole.notes.most_common(MOST_NOTES)
+    ]
+    more = len(whole.notes) - len(told)
+    return [*told, *([f"and {more:,} more notes (in the result files of -o FOLDER/)"] if more else [])]
 
 
 def _check_output(output: str) -> bool:
@@ -345,21 +398,66 @@ def _check_output(output: str) -> bool:
     return False
 
 
-def _show(
-    fleet: Fleet, labels: Sequence[str], settings: Settings, format: str, output: str | None, *, verbose: bool
-) -> None:
-    """Write the table of all sensors, then print the fleet in the chosen form."""
-    from accelcal_cli.calibration.fleet import standouts
-    from accelcal_cli.output.machine import write_table
-    from accelcal_cli.views import fleet as fleet_tables
+class _Shown:
+    """A calibrated fleet as it is shown and written.
 
-    outlying = standouts(fleet, settings.g)
-    rows = cache(partial(fleet_tables.sensors, fleet, labels, outlying))  # made when asked for
-    if output is not None:
-        write_table(rows(), output)
-    options.print_result(
-        format, rows, partial(fleet_tables.blocks, fleet, labels, outlying, settings.g, verbose)
-    )
+    Attributes:
+        fleet: its summary; check: which sensors keep the limits, None without limits.
+    """
+
+    def __init__(self, whole: Whole, settings: Settings, limits: Mapping[str, Limit] | None) -> None:
+        """Look which sensors stand out, and which are beyond limits."""
+        from accelcal_cli.calibration.fleet import standouts
+
+        self._whole, self._g = whole, settings.g
+        self.fleet = whole.summary()
+        self.labels: Sequence[str] = cast("Sequence[str]", self.fleet.labels)
+        self._outlying = standouts(self.fleet, settings.g)
+        self.check = None
+        if limits is not None:
+            from accelcal_cli.fleets.limits import check_limits
+
+            self.check = check_limits(self.fleet, limits, settings)
+
+    def _rows(self) -> Iterator[Table]:
+        """Yield the rows of the sensors, block by block."""
+        from accelcal_cli.views import fleet as tables
+
+        for part in self._whole.fleets():
+            low, high = int(part.number[0]), int(part.number[-1]) + 1
+            own = [replace(one, at=one.at - low) for one in self._outlying if low <= one.at < high]
+            table = tables.sensors(part, part.labels.tolist(), own)
+            if self.check is not None:
+                reasons = [self.check.reason(at) for at in range(low, high)]
+                table = tables.with_limits(table, self.check.passed[low:high], reasons)
+            yield table
+
+    def write(self, output: str) -> None:
+        """Write the rows of all sensors."""
+        from accelcal_cli.output.machine import write_tables
+
+        write_tables(self._rows(), output)
+
+    def show(self, format: str, verbose: bool) -> None:
+        """Print the fleet in the chosen form."""
+        if format == "table":
+            from accelcal_cli.output.console import show
+
+            show(self._blocks(verbose))
+        else:
+            from accelcal_cli.output.machine import write_text
+
+            write_text(self._rows(), sys.stdout, format)
+        sys.stdout.flush()
+
+    def _blocks(self, verbose: bool) -> list[Block]:
+        from accelcal_cli.views import fleet as tables
+
+        labels, check = self.labels, self.check
+        shown = tables.blocks(self.fleet, labels, self._outlying, self._g, verbose)
+        if check is None:
+            return shown
+        return [*tables.limit_blocks(check.passed, check.counts(), check.reason, labels, verbose), *shown]
 
 
 def _bad(fleet: Fleet, tolerance: float | None) -> dict[str, Bool]:

@@ -388,7 +388,7 @@ class DetectionOptions:
         from accelcal_cli.detection.rawlog import open_raw_log
 
         check_input(data)
-        self._settings(1.0)  # refuses what is wrong before the file is read
+        self.settings(1.0)  # refuses what is wrong before the file is read
         log = open_raw_log(
             data,
             split_columns(columns),
@@ -398,11 +398,12 @@ class DetectionOptions:
             options=form.read_options(),
         )
         try:
-            return detect(log, self._settings(gravity(log.columns.unit)), picture)
+            return detect(log, self.settings(gravity(log.columns.unit)), picture)
         finally:
             log.close()
 
-    def _settings(self, g: float) -> DetectSettings:
+    def settings(self, g: float) -> DetectSettings:
+        """Return the options as the library takes them; refuse what is wrong with them."""
         from accelcal_cli.detection.detect import MULTIPLIERS, DetectSettings
         from accelcal_cli.detection.windows import Spans, parse_span
 

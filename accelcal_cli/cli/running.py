@@ -118,7 +118,7 @@ class StudyOptions:
 
         journal = Journal.open(Path(f"{self.raw}.journal") if self.raw else None, study, self.resume)
         try:
-            with _progress(self.quiet) as progress:
+            with progress_bar(self.quiet) as progress:
                 records = run_study(study, journal, self._executors(study), progress)
             if self.raw is not None:
                 write_table(raw_table(study, records), self.raw)
@@ -131,7 +131,7 @@ class StudyOptions:
         return records
 
     def _executors(self, study: Study) -> Executors | None:
-        from accelcal_cli.studies import pools
+        import accelcal_cli.pools as pools
 
         if self.cluster is not None:
             return partial(pools.cluster, self.cluster)
@@ -164,7 +164,7 @@ def _kept(journal: Journal) -> str:
 
 
 @contextmanager
-def _progress(quiet: bool) -> Iterator[Progress | None]:
+def progress_bar(quiet: bool, what: str = "runs") -> Iterator[Progress | None]:
     """Open a bar with the time left on standard error, when somebody looks at it."""
     if quiet or not sys.stderr.isatty():
         yield None
@@ -175,7 +175,7 @@ def _progress(quiet: bool) -> Iterator[Progress | None]:
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("runs", total=None)
+        task = bar.add_task(what, total=None)
 
         def update(done: int, total: int) -> None:
             if bar.tasks[0].total is None:

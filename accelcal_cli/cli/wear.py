@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 from accelcal_cli.cli import options
 from accelcal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from accelcal_cli.detection.worn import Wear
+    from accelcal_cli.detection.worn import Wear, WornSettings
 
 APPLY = ("time", "gyro", "rate", "min_poses")
 """Options of a raw log that go with --worn."""
@@ -45,10 +46,10 @@ def find(
 ) -> Wear:
     """Find where a worn sensor rests; see `options.DetectionOptions.poses`, and `WornSettings` for `slopes`."""
     from accelcal_cli.detection.rawlog import open_raw_log
-    from accelcal_cli.detection.worn import WornSettings, find_wear
+    from accelcal_cli.detection.worn import find_wear
 
     options.check_input(data)
-    few = WornSettings.least_poses if misalignment else options.FACES
+    own = settings(log, misalignment=misalignment, slopes=slopes)
     raw = open_raw_log(
         data,
         options.split_columns(columns),
@@ -58,8 +59,15 @@ def find(
         options=form.read_options(),
     )
     try:
-        rate = options.check_positive("--rate", log.rate, " of rows per second")
-        g = gravity(raw.columns.unit)
-        return find_wear(raw, WornSettings(rate, log.min_poses or few, g, slopes and misalignment))
+        return find_wear(raw, replace(own, g=gravity(raw.columns.unit)))
     finally:
         raw.close()
+
+
+def settings(log: options.DetectionOptions, *, misalignment: bool, slopes: bool) -> WornSettings:
+    """Return the options of a raw log as the library takes them for days of wear; g is to be set."""
+    from accelcal_cli.detection.worn import WornSettings
+
+    few = WornSettings.least_poses if misalignment else options.FACES
+    rate = options.check_positive("--rate", log.rate, " of rows per second")
+    return WornSettings(rate, log.min_poses or few, slopes=slopes and misalignment)

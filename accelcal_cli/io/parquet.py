@@ -10,18 +10,20 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, TypeVar, cast
 
 import numpy as np
 import polars as pl
 
+from accelcal_cli.arrays import Int
 from accelcal_cli.errors import DataError, UsageError
 from accelcal_cli.io.formats.base import NativeTable, RandomAccess, no_room
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, InputTable, Selection, TextTable
 from accelcal_cli.io.rewrite import Change, system_errors
-from accelcal_cli.io.rows import RowBlock, RowFilter
+from accelcal_cli.io.rows import RowBlock, RowFilter, kept_row
 from accelcal_cli.io.stream import ByteSource
 from accelcal_cli.io.vocabulary import Facts
 
@@ -62,6 +64,8 @@ class FrameTable(ABC):
     rows_skipped = 0
     lenient = False  # its cells have types: none is broken
     source_format: str
+    seekable = False  # whether some rows can be read alone
+    window: tuple[int, int | None] = (0, None)  # first row that is read, and the one after the last
 
     def __init__(self, source: ByteSource) -> None:
         """Take over the source."""
@@ -113,7 +117,7 @@ class FrameTable(ABC):
         for column in selection.numbers:
             if not self.numeric[column]:
                 raise DataError(f'{self.name}, column "{self.names[column]}": does not hold numbers')
-        start = 0
+        start = self.window[0]
         for whole in self._batches(wanted or self.names):
             frame = whole if self.filter is None else self.filter.rows(whole)
             numbers = np.empty((frame.height, len(selection.numbers)))
@@ -132,8 +136,7 @@ class FrameTable(ABC):
         """Row number, counted from 1."""
         if self.filter is None:
             return _row
-        lines = self.filter.lines
-        return lambda row: _row(lines.line(row + 1) - 1)
+        return partial(kept_row, self.filter.lines)
 
     def close(self) -> None:
         """Close the file."""
@@ -154,10 +157,29 @@ class FrameTable(ABC):
             raise DataError(
                 f'{self.name}, column "{series.name}": holds {series.dtype}; text or numbers were expected as labels'
             ) from None
-        for row, label in enumerate(labels):
-            if not label:
-                raise DataError(f"{self._place(start + row, column)}: {NO_LABEL}")
-        return [label or "" for label in labels]
+        if not all(labels):
+            row = next(row for row, label in enumerate(labels) if not label)
+            raise DataError(f"{self._place(start + row, column)}: {NO_LABEL}")
+        return cast("list[str]", labels)
+
+    def runs(self, column: int) -> tuple[pl.Series, Int]:
+        """Return the labels of a column, each once for a run of equal ones, shape (R,), and the rows of each run."""
+        labels, lengths, start = list[pl.Series](), list[Int](), 0
+        for frame in self._batches([self.names[column]]):
+            cells = frame.to_series()
+            if cells.null_count():
+                self._labels(frame, start, column)  # names the row
+            short = cells.rle()
+            own = self._labels(short.struct.field("value").to_frame(self.names[column]), start, column)
+            rows = short.struct.field("len").to_numpy().astype(np.intp)
+            if labels and labels[-1][-1] == own[0]:
+                lengths[-1][-1] += rows[0]
+                own, rows = own[1:], rows[1:]
+            if own:
+                labels.append(pl.Series(own, dtype=pl.String))
+                lengths.append(rows)
+            start += frame.height
+        return pl.concat(labels), np.concatenate(lengths)
 
     def _place(self, row: int, column: int) -> str:
         return f'{self.name}, {self.where(row)}, column "{self.names[column]}"'
@@ -182,6 +204,7 @@ class ParquetTable(FrameTable):
         except BaseException:
             self._file.close()
             raise
+        self.seekable = path is not None
 
     @staticmethod
     def _scan(path: Path) -> pl.LazyFrame:
@@ -198,14 +221,14 @@ class ParquetTable(FrameTable):
             return self._scan(self._path).head(PREVIEW).collect()
 
     def _batches(self, wanted: Sequence[str]) -> Iterator[pl.DataFrame]:
-        lazy, read = self._scan(self._path).select(wanted), 0
-        while not (frame := self._batch(lazy, read)).is_empty():
+        lazy, (read, end) = self._scan(self._path).select(wanted), self.window
+        while read != end and not (frame := self._batch(lazy, read, end)).is_empty():
             read += frame.height
             yield frame
 
-    def _batch(self, lazy: pl.LazyFrame, start: int) -> pl.DataFrame:
+    def _batch(self, lazy: pl.LazyFrame, start: int, end: int | None) -> pl.DataFrame:
         with _named_errors(self.name, self.form):
-            return lazy.slice(start, ROWS).collect()
+            return lazy.slice(start, ROWS if end is None else min(ROWS, end - start)).collect()
 
     def close(self) -> None:
         """Remove the copy and close the file."""
@@ -449,17 +472,17 @@ def to_parquet(table: InputTable, change: Change, file: IO[bytes]) -> None:
     target = file.name if isinstance(file.name, str) else file  # an open descriptor has a number for a name
     if isinstance(table, FrameTable | NativeTable):
         with system_errors():
-            _sink(frames(table, change), target)
+            sink(frames(table, change), target)
         return
     assert isinstance(table, TextTable)
     cells = TextCells(table, change)
     with tempfile.TemporaryDirectory(prefix="accelcal-") as folder:
         parts = cells.keep(Path(folder))
         with system_errors():
-            _sink(cells.typed(parts), target)
+            sink(cells.typed(parts), target)
 
 
-def _sink(blocks: Iterator[pl.DataFrame], target: str | IO[bytes]) -> None:
+def sink(blocks: Iterator[pl.DataFrame], target: str | IO[bytes]) -> None:
     """Write blocks as they come."""
     from polars.io.plugins import register_io_source
 

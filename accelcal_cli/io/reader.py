@@ -11,7 +11,7 @@ import math
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
@@ -32,7 +32,7 @@ from accelcal_cli.io.dialect import (
     to_number,
     understand,
 )
-from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter
+from accelcal_cli.io.rows import MOST_BAD, SKIPPABLE, LineMap, PassedLines, RowBlock, RowFilter, kept_line
 from accelcal_cli.io.stream import LONGEST_LINE, TYPED, ByteSource, Source, open_source
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.schema import frozen
@@ -64,7 +64,7 @@ class ReadOptions:
         line: what the lines of readings begin with, among lines of several kinds; None to find them by their words.
         count: the column of counts, or ``none``; None to find it by its name.
         where: conditions that the rows to read meet, each as COLUMN=VALUE.
-        accelerometer: the one to read of a log that has several, by the name that the log gives it.
+        accelerometer: of a log that has several, by its name there; many: whether polars reads short inputs, too.
     """
 
     skip_rows: int = 0
@@ -73,6 +73,7 @@ class ReadOptions:
     count: str | None = None
     where: tuple[str, ...] = ()
     accelerometer: str | None = None
+    many: bool = False
 
 
 PLAIN = ReadOptions()
@@ -274,14 +275,14 @@ class TextTable:
         """Read blocks of whole lines, each with the selected columns of its rows."""
         careful = CarefulParser(self.name, self.dialect, selection, self.filter, lenient=self.lenient)
         self._lines, self.passed = careful.lines, careful.passed
-        parse = careful.parse if self._source.whole else FastParser(careful).parse
+        parser = careful if self._source.whole and not self._options.many else FastParser(careful)
         for raw in self._source.blocks():
             block = raw if self._words is None else self._words.translate(raw)
             top = _top(block, self.dialect.top) if careful.line == 0 else 0
             if top and (kept := self._kept(block[:top], top=self.dialect.top > 0)):
                 yield kept, careful.parse(kept)
             if top < len(block) and (kept := self._kept(block[top:])):
-                yield kept, parse(kept)
+                yield kept, parser.parse(kept)
         if self.filter is not None:
             self.filter.check()
         careful.check_passed()
@@ -295,8 +296,7 @@ class TextTable:
         """Line of a row that has been read."""
         if self.filter is None:
             return self._lines.where
-        lines, kept = self._lines, self.filter.lines
-        return lambda row: f"line {kept.line(lines.line(row))}"
+        return partial(kept_line, self._lines, self.filter.lines)
 
     def close(self) -> None:
         """Release the file."""

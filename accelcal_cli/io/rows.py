@@ -119,6 +119,21 @@ class LineMap:
         return f"line {self.line(row)}"
 
 
+def kept_line(lines: LineMap, kept: LineMap, row: int) -> str:
+    """Return how to name a row of lines that a filter kept; a function of its own, so that processes can send it."""
+    return f"line {kept.line(lines.line(row))}"
+
+
+def kept_row(kept: LineMap, row: int) -> str:
+    """Return how to name a row, from 0, of those that a filter kept: ``row 8``."""
+    return f"row {kept.line(row + 1)}"
+
+
+def left_row(where: Callable[[int], str], rows: LineMap, pose: int) -> str:
+    """Return how to name a pose, where rows before it may have been left out or not read."""
+    return where(rows.line(pose))
+
+
 @dataclass(eq=False)
 class PassedLines:
     """Lines below the header that are no rows: broken, cut off, headers again, of other sensors.
@@ -491,6 +506,12 @@ def add_stretches(stretches: list[tuple[int, int]], rows: Int) -> None:
         firsts, lasts = firsts[1:], lasts[1:]
     room = SHOWN - len(stretches)
     stretches += zip(firsts[:room].tolist(), lasts[:room].tolist(), strict=True)
+
+
+def set_aside(idle: dict[int, list[int]], codes: Int, keep: Bool, start: int) -> None:
+    """Add the rows that are not kept, from `start` on, to those of their sensors, by its number."""
+    for row in np.flatnonzero(~keep).tolist():
+        idle.setdefault(int(codes[row]), []).append(start + row)
 
 
 def places(stretches: list[tuple[int, int]], where: Callable[[int], str]) -> str:

@@ -541,6 +541,15 @@ class RowStore:
                 block = np.fromfile(self._file, count=count * self.width)
             yield start, block.reshape(count, self.width)
 
+    def part(self, start: int, stop: int) -> Float:
+        """Return the rows from `start` to `stop` - 1, (B, width); they are read-only or private."""
+        self._settle()
+        if self._file is None:
+            return self._in_memory()[start:stop]
+        with _named_disk_errors():
+            self._file.seek(start * self.width * 8)
+            return np.fromfile(self._file, count=(stop - start) * self.width).reshape(-1, self.width)
+
     def all(self) -> Float:
         """Every row, (rows, width)."""
         self._settle()

@@ -175,16 +175,30 @@ def whole_folder(path: str) -> Iterator[Path]:
     try:
         temporary = tempfile.mkdtemp(prefix=MARK, suffix=UNFINISHED, dir=target.parent)
         yield Path(temporary)
-        os.chmod(temporary, _mode(target, 0o777))
-        if target.is_dir():
-            target.rmdir()
-        os.replace(temporary, target)
+        publish_folder(Path(temporary), path)
         temporary = ""
     except OSError as error:
         raise unwritten(path, error) from None
     finally:
         if temporary:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def publish_folder(folder: Path, path: str) -> None:
+    """Let a finished folder, on the same file system, appear under its name.
+
+    Raises:
+        OutputError: it cannot, or there is something already.
+    """
+    check_folder(path)
+    target = _target(path)
+    try:
+        os.chmod(folder, _mode(target, 0o777))
+        if target.is_dir():
+            target.rmdir()
+        os.replace(folder, target)
+    except OSError as error:
+        raise unwritten(path, error) from None
 
 
 def unwritten(path: str, error: OSError) -> OutputError:

@@ -57,10 +57,11 @@ def latex_text(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_csv(table: Table, file: IO[str]) -> None:
+def write_csv(table: Table, file: IO[str], *, head: bool = True) -> None:
     """Write a table as CSV: keys of the columns, then rows; numbers with all their digits, nothing for none."""
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([column.label for column in table.columns])
+    if head:
+        writer.writerow([column.label for column in table.columns])
     inf = math.inf
     rows = table.rows
     if file.isatty():
@@ -87,13 +88,37 @@ def write_table(table: Table, path: str) -> None:
     Raises:
         OutputError: it cannot be written.
     """
+    write_tables([table], path)
+
+
+def write_tables(tables: Iterable[Table], path: str) -> None:
+    """Write tables of the same columns as one, of which only one is in memory at a time; see `write_table`.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     with whole_file(path, binary=path.endswith(".parquet")) as file:
         if path.endswith(".parquet"):
-            frame(table).write_parquet(file)
-        elif path.endswith(".json"):
-            file.write(json_text(json_rows([table])))
+            from accelcal_cli.io.parquet import sink
+
+            sink(map(frame, tables), file.name if isinstance(file.name, str) else file)
         else:
-            write_csv(table, file)
+            write_text(tables, file, "json" if path.endswith(".json") else "csv")
+
+
+def write_text(tables: Iterable[Table], file: IO[str], format: str) -> None:
+    """Write tables of the same columns as one, as CSV or JSON."""
+    if format == "csv":
+        for k, table in enumerate(tables):
+            write_csv(table, file, head=k == 0)
+        return
+    behind = "["
+    for table in tables:
+        rows = json_text(json_rows([table])).rstrip()
+        if len(rows) > len("[]"):
+            file.write(behind + rows[1:-2])
+            behind = ","
+    file.write("[]\n" if behind == "[" else "\n]\n")
 
 
 def frame(table: Table) -> polars.DataFrame:
@@ -129,10 +154,20 @@ FORBIDDEN = '/\\:*?"<>|%'
 """Characters that a file name cannot have on some system, and the one that stands for them."""
 
 
-def write_result(folder: Path, label: str, result: Calibration) -> None:
+def result_line(result: Calibration) -> str:
+    """Return what the result file of one sensor of a fleet holds."""
+    return json.dumps(result.record(), allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def write_result(folder: Path, label: str, text: str) -> None:
     """Write the result file of one sensor, named by its label."""
-    text = json.dumps(result.record(), allow_nan=False, ensure_ascii=False)
-    (folder / f"{file_name(label)}.json").write_text(f"{text}\n", encoding="utf-8", newline="\n")
+    (folder / f"{file_name(label)}.json").write_text(text, encoding="utf-8", newline="\n")
+
+
+def remove_results(folder: Path, labels: Iterable[str]) -> None:
+    """Remove the result files of sensors."""
+    for label in labels:
+        (folder / f"{file_name(label)}.json").unlink(missing_ok=True)
 
 
 def file_name(label: str) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from accelcal_cli.arrays import Float, Int
+from accelcal_cli.arrays import Bool, Float, Int
 from accelcal_cli.calibration.fleet import FAILED, NOISE, Fleet, Standout
 from accelcal_cli.calibration.observability import PARAMETERS
 from accelcal_cli.notices import Notice, in_one
@@ -293,3 +293,38 @@ def _not_good(fleet: Fleet, labels: Sequence[str], bad: Int, most: int) -> Table
     rows = tuple((labels[r], fleet.verdict[r], _why(fleet, r)) for r in order[:most])
     columns = (Column("sensor"), Column("verdict"), Column("why"))
     return Table("Not good", columns, rows, _more(len(bad), most))
+
+
+def with_limits(table: Table, passed: Bool, reasons: Sequence[str]) -> Table:
+    """Return the rows of sensors with whether each keeps the limits, shape (R,), and why not."""
+    columns = (*table.columns, Column("passed"), Column("failed limits", key="failed_limits"))
+    words = ("false", "true")
+    ends = zip(table.rows, passed.tolist(), reasons, strict=True)
+    return Table(
+        table.title, columns, tuple((*row, words[one], reason) for row, one, reason in ends), table.notes
+    )
+
+
+def limit_blocks(
+    passed: Bool,
+    counts: Mapping[str, int],
+    reason: Callable[[int], str],
+    labels: Sequence[str],
+    verbose: bool = False,
+) -> list[Block]:
+    """Return how many sensors keep the limits and which do not.
+
+    Args:
+        passed: which do, shape (R,); counts: how many do not, by parameter; reason: why one does not, by its number.
+        labels: of the sensors; verbose: more of them.
+    """
+    bad, most = np.flatnonzero(~passed), SHOWN if verbose else FEW_SHOWN
+    beyond = ", ".join(f"{kind} {n:,}" for kind, n in counts.items() if n)
+    line = f"Limits: {len(passed) - len(bad):,} of {len(passed):,} sensors pass" + (
+        f"; beyond: {beyond}" if beyond else ""
+    )
+    if not len(bad):
+        return [Paragraph(line), BLANK]
+    rows = tuple((labels[r], reason(r)) for r in bad[:most].tolist())
+    more = _more(len(bad), most, " (column failed_limits of --format csv)")
+    return [Paragraph(line), BLANK, Table("Beyond the limits", (Column("sensor"), Column("why")), rows, more)]

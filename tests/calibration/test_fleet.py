@@ -530,8 +530,8 @@ def test_what_a_fleet_cannot_do_is_refused(wrong):
 def test_slabs_and_batches_change_nothing(mixed, monkeypatch):
     path, _ = mixed
     whole = calibrate_fleet(read_fleet([path]), LM)
-    monkeypatch.setattr("accelcal_cli.io.fleet.SLAB", 30)
-    monkeypatch.setattr("accelcal_cli.io.fleet.BATCH", 40)
+    monkeypatch.setattr("accelcal_cli.io.batches.SLAB", 30)
+    monkeypatch.setattr("accelcal_cli.io.batches.BATCH", 40)
     parts = calibrate_fleet(read_fleet([path]), LM)
     np.testing.assert_array_equal(parts.number, whole.number)
     assert parts.verdict.tolist() == whole.verdict.tolist()

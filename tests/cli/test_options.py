@@ -28,8 +28,8 @@ COMMANDS = {name: typer.main.get_command(app).commands[name] for name in NAMES}
 def test_the_choices_are_those_of_the_library():
     assert typing.get_args(Gauge) == options.GAUGES
     assert typing.get_args(settings.Weights) == options.WEIGHTS
-    assert typing.get_args(settings.Robust) == calibrate.ROBUST
-    assert typing.get_args(settings.Attitudes) == calibrate.ATTITUDES
+    assert typing.get_args(settings.Robust) == options.ROBUST
+    assert typing.get_args(settings.Attitudes) == options.ATTITUDES
     assert set(SCHEMES) == set(options.SCHEMES)
     assert FIXTURES == options.FIXTURES
     assert optimizer.PRESETS == calibrate.PRESETS == running.PRESETS

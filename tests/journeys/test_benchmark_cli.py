@@ -189,7 +189,7 @@ def test_bad_input_is_one_message(run, tmp_path, arguments, message):
 
 def test_a_cluster_that_does_not_answer_leaves_nothing(run, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    from accelcal_cli.studies import pools
+    from accelcal_cli import pools
 
     monkeypatch.setattr(pools, "ANSWER_TIME", 0.3)
     done = run(*QUICK, *PAIR, "--raw", "raw.csv", "--cluster", "tcp://127.0.0.1:9")

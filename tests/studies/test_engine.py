@@ -7,18 +7,19 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
-import time
 from functools import partial
 from multiprocessing import active_children
 from pathlib import Path
+from threading import Thread
 
 import pytest
+from programs import group, program, until
 
+from accelcal_cli import pools
 from accelcal_cli.errors import DataError, OutputError
 from accelcal_cli.output.machine import write_table
-from accelcal_cli.studies import engine, pools
+from accelcal_cli.studies import engine
 from accelcal_cli.studies.benchmark import Benchmark
 from accelcal_cli.studies.engine import Journal, run_study
 from accelcal_cli.studies.study import Entry, Task
@@ -50,32 +51,10 @@ def raw(records, folder: Path, name="raw.csv") -> bytes:
     return (folder / name).read_bytes()
 
 
-def program(folder: Path, *arguments: str, **options) -> subprocess.Popen[str]:
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "error"}
-    return subprocess.Popen(
-        [sys.executable, "-m", *arguments],
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,
-    )
-
-
 def accelcal(folder: Path, *arguments: str) -> tuple[int, str]:
     process = program(folder, "accelcal_cli", *arguments)
     _, errors = process.communicate(timeout=300)
     return process.returncode, errors
-
-
-def until(condition, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        time.sleep(0.02)
 
 
 def lines(path: Path) -> int:
@@ -135,37 +114,6 @@ def test_workers_have_one_thread_and_the_parent_keeps_its_environment(monkeypatc
 # Clusters
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """The address of a Dask scheduler with two workers, processes of their own on this machine."""
-    pytest.importorskip("distributed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    port = address.rpartition(":")[2]
-    quiet = {"PYTHONWARNINGS": "default"}
-    commands = [
-        ["scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"],
-        *[["worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny"]] * 2,
-    ]
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, **quiet, "PYTHONPATH": path}
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "dask", *command],
-            cwd=tmp_path,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for command in commands
-    ]
-    yield address, processes
-    for process in processes:
-        process.kill()
-        process.wait()
-
-
 def test_a_cluster_gives_the_same_bytes_also_when_a_worker_dies(cluster, tmp_path):
     address, processes = cluster
     line = [*LINE, "--raw"]
@@ -185,6 +133,36 @@ def test_a_cluster_that_does_not_answer(monkeypatch):
         pytest.raises(DataError, match="no Dask scheduler answers there"),
         pools.cluster("tcp://127.0.0.1:9"),
     ):
+        pass
+
+
+@pytest.mark.parametrize("greeting", [b"", b"SSH-2.0-OpenSSH_9.6\r\n", b"cut"])
+def test_the_port_of_another_server(monkeypatch, greeting):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(pools, "ANSWER_TIME", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            client, _ = server.accept()
+            with client:
+                client.sendall(greeting)
+                client.recv(1) if not greeting else None
+
+        thread = Thread(target=answer)
+        thread.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            pytest.raises(DataError, match=r"no Dask scheduler|another server") as refused,
+            pools.cluster(address),
+        ):
+            pass
+        thread.join()
+    assert "\n" not in str(refused.value)
+
+
+def test_tls_without_certificates():
+    pytest.importorskip("distributed")
+    with pytest.raises(DataError, match=r"tls:// needs certificates"), pools.cluster("tls://127.0.0.1:8786"):
         pass
 
 
@@ -214,7 +192,7 @@ def test_a_killed_study_goes_on_to_the_same_bytes(jobs, tmp_path):
     study.send_signal(signal.SIGKILL)
     study.communicate()
     assert study.returncode == -signal.SIGKILL
-    until(lambda: not _group(study.pid))  # no worker outlives its parent
+    until(lambda: not group(study.pid))  # no worker outlives its parent
     assert not (tmp_path / "raw.csv").exists()
     assert accelcal(tmp_path, *line)[0] == 2  # not without being told to
     kept = lines(tmp_path / "raw.csv.journal")
@@ -224,15 +202,6 @@ def test_a_killed_study_goes_on_to_the_same_bytes(jobs, tmp_path):
     assert not (tmp_path / "raw.csv.journal").exists()
     assert accelcal(tmp_path, *LINE, "--raw", "whole.csv") == (0, "")
     assert (tmp_path / "raw.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
-
-
-def _group(leader: int) -> bool:
-    """Whether any process of a session's group is left."""
-    try:
-        os.killpg(leader, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 @pytest.mark.parametrize(
@@ -257,7 +226,7 @@ def test_an_interrupt_keeps_finished_runs(jobs, tmp_path, number, code, said):
     assert message.startswith(f"accelcal: {said}; ")
     assert "--resume" in message
     assert {path.name for path in tmp_path.iterdir()} == {"raw.csv.journal"}
-    until(lambda: not _group(study.pid))
+    until(lambda: not group(study.pid))
 
 
 # The journal

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
@@ -26,7 +26,7 @@ import numpy as np
 from accelcal_cli.arrays import Float
 from accelcal_cli.errors import AccelcalError, DataError, UsageError, did_you_mean
 from accelcal_cli.io.reader import LIMIT, NO_LABEL, PLAIN, ReadOptions, Selection
-from accelcal_cli.io.rows import RowBlock, RowFilter
+from accelcal_cli.io.rows import RowBlock, RowFilter, kept_row
 from accelcal_cli.io.stream import BackgroundThread, ByteSource
 from accelcal_cli.io.vocabulary import Facts
 from accelcal_cli.registry import Registry
@@ -331,8 +331,7 @@ class NativeTable:
         """Row number, counted from 1."""
         if self.filter is None:
             return _row
-        lines = self.filter.lines
-        return lambda row: _row(lines.line(row + 1) - 1)
+        return partial(kept_row, self.filter.lines)
 
     def close(self) -> None:
         """Close the log and the file."""

@@ -1,10 +1,11 @@
-"""Where a study runs: processes on this machine, or a Dask cluster, both as executors of concurrent.futures."""
+"""Where studies and fleets run: processes here, or a Dask cluster, both as executors of concurrent.futures."""
 
 from __future__ import annotations
 
 import logging
 import os
 import signal
+import socket
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -19,6 +20,9 @@ from accelcal_cli.errors import DataError
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 ANSWER_TIME = 10.0
 """Seconds that a cluster has to answer."""
+
+LONGEST_GREETING = 1 << 20
+"""Bytes of the greeting of a Dask scheduler, at most."""
 
 
 @contextmanager
@@ -100,11 +104,15 @@ def cluster(address: str) -> Iterator[Executor]:
     where = f"--cluster {address}"
     try:
         # A client with an address that is none fails too, but is heard once more when it is collected.
-        port = get_address_host_port(address)[1]
+        host, port = get_address_host_port(address)
     except ValueError as error:
         raise DataError(f"{where}: expected tcp://host:port ({error})") from None
     if not 0 < port < 65536:
         raise DataError(f"{where}: expected tcp://host:port with a port from 1 to 65535")
+    if address.startswith("tls://"):
+        _check_certificates(where)
+    else:
+        _check_speaks(where, host, port)
     connect: Any = distributed.Client
     with _silent("distributed", "distributed.client"):
         try:
@@ -116,9 +124,37 @@ def cluster(address: str) -> Iterator[Executor]:
             try:
                 yield client.get_executor(pure=False)
             except KilledWorker:
-                raise DataError(f"{where}: a part of the study ends every worker that runs it") from None
+                raise DataError(f"{where}: a part of the work ends every worker that runs it") from None
             except (CancelledError, OSError):
                 raise DataError(f"{where}: the scheduler was lost") from None
+
+
+def _check_certificates(where: str) -> None:
+    """Raise DataError where the configuration of Dask names no certificates, without which tls:// cannot be spoken."""
+    import dask.config
+
+    if dask.config.get("distributed.comm.tls.ca-file", None) is None:
+        raise DataError(
+            f"{where}: tls:// needs certificates; name them in the configuration of Dask "
+            "(distributed.comm.tls: ca-file, client.cert, client.key)"
+        )
+
+
+def _check_speaks(where: str, host: str, port: int) -> None:
+    """Raise DataError where what answers is no Dask scheduler: it speaks first, the size of its greeting in 8 bytes.
+
+    A client of Dask would wait for minutes.
+    """
+    try:
+        with socket.create_connection((host, port), timeout=ANSWER_TIME) as answering:
+            answering.settimeout(ANSWER_TIME)
+            head = answering.recv(8, socket.MSG_WAITALL)
+    except TimeoutError:
+        raise DataError(f"{where}: no Dask scheduler answers there, in {ANSWER_TIME:g} s") from None
+    except OSError:
+        return  # a scheduler that is just starting: the client waits for it, and tells if it waited in vain
+    if len(head) < 8 or int.from_bytes(head, "little") > LONGEST_GREETING:
+        raise DataError(f"{where}: another server answers there, not a Dask scheduler")
 
 
 @contextmanager
