@@ -25,7 +25,7 @@ FLOW = {
     # files and pairs of files; 61 and 101 in the first version, 36 and 61 in the new house
     "calibrate": (42, 76),  # 36 and 61; results print themselves, and the library takes what commands take
     "detect": (42, 59),  # 58 and 89; 35 and 52
-    "fleet": (45, 76),  # 56 and 69; 34 and 46; then blocks that are kept and sent, and a bar of progress
+    "fleet": (45, 74),  # 56 and 69; 34 and 46; then blocks that are kept and sent, and a bar of progress
     "benchmark": (28, 68),  # 59 and 64; 26 and 59, before hits, running times and instances
 }
 RETURNS = 155
