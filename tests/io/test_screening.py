@@ -177,6 +177,15 @@ def test_readings_without_gravity_are_named(poses):
     assert np.mean(named) > 0.9
 
 
+def test_a_sphere_that_is_clipped_on_all_sides_is_not_without_gravity():
+    """What is left of it is a cube, most of whose values are alike."""
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        u = rng.normal(0, 1, (12, 3))
+        output = 9.8 * u / np.linalg.norm(u, axis=1, keepdims=True) + rng.normal(0, 0.02, u.shape)
+        assert "gravity-removed" not in keys(np.clip(output, -5.49, 5.49))
+
+
 def test_all_clipped_poses_are_named():
     rows = np.clip(
         np.round(8192 * held(attitudes("turns", None), np.random.default_rng(3)) * 1.004), -8192, 8191
