@@ -38,6 +38,9 @@ def parameter_tables(result: Calibration) -> list[Table]:
                 row[value + 1] = ""  # a zero of the gauge is exact
     for row in cells:
         row[1:] = ["" if b is None and a == quoted.UNKNOWN else b for a, b in pairwise(row)]
+        for value in range(1, len(row), 2):
+            if isinstance(row[value], float) and isinstance(row[value + 1], float):
+                row[value : value + 2] = quoted.quote(row[value], row[value + 1])
     first = replace(first, rows=tuple(cells))
     return [first, engineering(result), *rest]
 
