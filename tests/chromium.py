@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import http.client
 import json
 import shutil
 import socket
@@ -11,7 +12,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,8 +96,9 @@ class Browser:
         file.write_bytes(base64.b64decode(answer["data"]))
 
     def close(self) -> None:
-        """End the session."""
-        self._call("DELETE", self.session, None)
+        """End the session; a driver that is gone before it has answered has ended it, too."""
+        with suppress(OSError, http.client.HTTPException):
+            self._call("DELETE", self.session, None)
 
     def _post(self, path: str, body: Any) -> Any:
         return self._call("POST", path, body)

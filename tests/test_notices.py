@@ -180,7 +180,7 @@ def _made():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Notice":
                 stated = [getattr(argument, "value", None) for argument in node.args[:2]]
-                if all(isinstance(word, str) for word in stated):
+                if stated and all(isinstance(word, str) for word in stated):
                     yield tuple(stated)
 
 

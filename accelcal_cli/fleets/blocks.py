@@ -27,6 +27,7 @@ from accelcal_cli.errors import AccelcalError, UsageError
 from accelcal_cli.io.batches import FleetReadings, cuts
 from accelcal_cli.io.fleet import FleetCollector, Window, check_once, check_poses, file_names, notes_of
 from accelcal_cli.io.reader import PLAIN, ReadOptions, open_table
+from accelcal_cli.io.stream import open_source
 from accelcal_cli.sensor.model import local_gravity
 
 if TYPE_CHECKING:
@@ -309,7 +310,7 @@ def expanded(sources: Sequence[str]) -> tuple[list[str], bool]:
     """Return files for folders and patterns, and whether one was a folder: the partitions of a table.
 
     Raises:
-        UsageError: a folder or a pattern without files, or a file twice.
+        UsageError: a folder or a pattern without files, or a file twice. DataError: no such file.
     """
     found: list[str] = []
     for source in sources:
@@ -324,6 +325,8 @@ def expanded(sources: Sequence[str]) -> tuple[list[str], bool]:
             if not files:
                 raise UsageError(f"{source}: no file has such a name")
         else:
+            if source != "-" and not os.path.exists(source):
+                open_source(source)  # says why it cannot
             files = [source]
         found += files
     check_once(found)

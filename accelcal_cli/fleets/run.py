@@ -483,5 +483,5 @@ def trimmed(fleet: Fleet) -> Mapping[str, np.ndarray]:
 
 
 STANDS_FOR = "..."
-SOME = (Notice("more", "note", STANDS_FOR),)
+SOME = (Notice(STANDS_FOR, "note", STANDS_FOR),)
 """What stands for the sentences of the sensors that a summary does not name."""

@@ -239,7 +239,9 @@ class Screened:
         if few and self.zeros:
             return True
         volume = self.ties.surface is not None and thickness(self.output) > NO_SURFACE
-        return volume and (few or self._is_one_blob()) and not self._clipped_at  # a clipped sphere fills a volume
+        return (
+            volume and (few or self._is_one_blob()) and not self._clipped_at
+        )  # a clipped sphere fills a volume
 
     def _is_one_blob(self) -> bool:
         """Whether distances from the middle spread as those of noise, not as those of a sphere with a few outliers."""

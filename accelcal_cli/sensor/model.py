@@ -203,7 +203,8 @@ def misalignment(K: Float) -> Float:
     """
     rows = K / sensitivity(K)[..., None]
     first, second = np.transpose(AXIS_PAIRS)
-    return np.asarray(np.arcsin(np.sum(rows[..., first, :] * rows[..., second, :], axis=-1)))
+    cosine = np.sum(rows[..., first, :] * rows[..., second, :], axis=-1)
+    return np.asarray(np.arcsin(np.clip(cosine, -1.0, 1.0)))  # rounding takes two axes that are one beyond 1
 
 
 def bias_force(K: Float, D: Float) -> Float:

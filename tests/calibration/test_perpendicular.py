@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 from simulated import DPSO, noise
 
 from accelcal_cli.calibration.calibrate import calibrate
-from accelcal_cli.calibration.fleet import check_settings
 from accelcal_cli.calibration.result import Calibration
 from accelcal_cli.calibration.settings import Settings
 from accelcal_cli.errors import ConfigError
@@ -103,9 +102,7 @@ def test_what_does_not_go_with_it_is_refused(other):
         replace(SIX, **other)
 
 
-def test_a_fleet_wants_misalignments_and_verify_does_not():
-    with pytest.raises(ConfigError, match="misalignment: False"):
-        check_settings(SIX)
+def test_verify_does_without_misalignments():
     found = verify(calibrate(read(poses.turns(), sigma=1e-2), SIX), read(poses.turns(), sigma=1e-2, seed=2))
     assert (found.verdict, found.directions) == ("unchanged", 6)
 

@@ -211,7 +211,7 @@ FLEET = {
     "gauge": (["fleet.csv", "--gauge", "lwer"], ["gauge", "lwer", 'did you mean "lower"']),
     "gauge full": (["fleet.csv", "--gauge", "full"], ["gauge: full", "lower, upper, symmetric"]),
     "weights": (["fleet.csv", "--weights", "all"], ["weights", "all", "none, n, sd"]),
-    "weights auto": (["fleet.csv", "--weights", "auto"], ["weights: auto", "none, n, sd"]),
+    "weights auto": (["fleet.csv", "--weights", "auto"], ["--weights auto needs", "columns n, sx, sy, sz"]),
     "weights without counts": (["fleet.csv", "--weights", "n"], ["fleet.csv", 'sensor "A"', "--weights n"]),
     "optimizer": (["fleet.csv", "--config", "optimizer.yaml"], ["optimizer", "levenberg-marquardt"]),
     "unknown key": (

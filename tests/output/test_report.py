@@ -26,6 +26,7 @@ from accelcal_cli.output import certificate, figures
 from accelcal_cli.output.document import prose, typeset
 from accelcal_cli.output.report import fleet_page, page, side_by_side
 from accelcal_cli.sensor import poses
+from accelcal_cli.views.quoted import quote
 
 G = 9.8
 VOID = ("meta", "link", "br")
@@ -147,8 +148,8 @@ def test_a_page_holds_every_part(good):
         good.data["sha256"],
         f"accelcal {accelcal_cli.__version__}",
         "accelcal/calibration/3",
-        f"{good.K_a[0, 0]:.8g}",
-        f"{good.interval.D_a[2]:.2g}",
+        *quote(good.K_a[0, 0], good.interval.K_a[0, 0]),
+        *quote(good.D_a[2], good.interval.D_a[2]),
         "scale factor error x",
         "misalignment yz",
         "population: 20",
