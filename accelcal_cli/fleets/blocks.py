@@ -310,7 +310,7 @@ def expanded(sources: Sequence[str]) -> tuple[list[str], bool]:
     """Return files for folders and patterns, and whether one was a folder: the partitions of a table.
 
     Raises:
-        UsageError: a folder or a pattern without files, or a file twice. DataError: no such file.
+        UsageError: a folder or a pattern without files, or a file twice.
     """
     found: list[str] = []
     for source in sources:
@@ -325,8 +325,6 @@ def expanded(sources: Sequence[str]) -> tuple[list[str], bool]:
             if not files:
                 raise UsageError(f"{source}: no file has such a name")
         else:
-            if source != "-" and not os.path.exists(source):
-                open_source(source)  # says why it cannot
             files = [source]
         found += files
     check_once(found)
@@ -350,6 +348,9 @@ def supply(
     collect = partial(FleetCollector, columns, sensor, options)
     if len(files) > 1 and sensor is None and not parted:
         return _of_files(files, collect)
+    for source in files:  # a table without one of its parts is another table
+        if source != "-" and not os.path.exists(source):
+            open_source(source)  # says why it cannot
     direct = None if "-" in files or options.where else _direct(files, work, collect)
     return direct or _carried(files, work, collect, stdin)
 
