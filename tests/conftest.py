@@ -6,8 +6,10 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import chromium
 import hypothesis
 import pytest
 
@@ -61,3 +63,13 @@ def cluster(tmp_path):
     for process in processes:
         process.kill()
         process.wait()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[chromium.Browser]:
+    """A session of headless Chromium for the tests of a file."""
+    path = chromium.browser()
+    if path is None:
+        pytest.skip("no chromium and chromedriver here: apt-get install chromium chromium-driver")
+    with chromium.session(path) as session:
+        yield session

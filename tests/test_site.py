@@ -114,15 +114,6 @@ def address(site) -> Iterator[str]:
     server.server_close()
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[chromium.Browser]:
-    path = chromium.browser()
-    if path is None:
-        pytest.skip("needs chromium and chromedriver")
-    with chromium.session(path) as session:
-        yield session
-
-
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "light")])
 def test_pages_are_quiet_and_fit(browser, address, width, scheme):
     """No error on the console, no request to elsewhere, nothing wider than the window, nothing serious for axe."""

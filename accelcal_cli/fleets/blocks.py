@@ -572,25 +572,24 @@ class FilesBlock(Block):
         return Outcome(joined(parts), gravity, texts, notes, str(faults[0]) if bad else "")
 
 
+def stretches(total: int, size: int, done: frozenset[int]) -> Iterator[tuple[int, slice]]:
+    """Yield the number and the files of the blocks of `size` files that are not done."""
+    for at, start in enumerate(range(0, total, size)):
+        if at not in done:
+            yield at, slice(start, start + size)
+
+
 def _of_files(files: Sequence[str], collect: Callable[[], FleetCollector]) -> Supply:
     """Return blocks of files of one sensor each."""
     names = file_names(files)
-    starts = range(0, len(files), TOGETHER)
 
     def blocks(done: frozenset[int]) -> Iterator[tuple[int, Block]]:
-        for at, start in enumerate(starts):
-            own = slice(start, start + TOGETHER)
-            if at not in done:
-                yield (
-                    at,
-                    FilesBlock(
-                        len(files[own]),
-                        known(files[own]),
-                        sources=tuple(files[own]),
-                        sensors=tuple(names[own]),
-                        collect=collect,
-                    ),
-                )
+        for at, own in stretches(len(files), TOGETHER, done):
+            known_files, sources, sensors = known(files[own]), tuple(files[own]), tuple(names[own])
+            yield (
+                at,
+                FilesBlock(len(sources), known_files, sources=sources, sensors=sensors, collect=collect),
+            )
 
     identity = [[source, *state_of(source)] for source in files]
-    return Supply(_named(files), len(files), len(starts), identity, (), blocks)
+    return Supply(_named(files), len(files), -(-len(files) // TOGETHER), identity, (), blocks)

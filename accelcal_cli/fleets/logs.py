@@ -27,6 +27,7 @@ from accelcal_cli.fleets.blocks import (
     labelled,
     reason_of,
     state_of,
+    stretches,
 )
 from accelcal_cli.io.fleet import file_names
 from accelcal_cli.io.reader import PLAIN, ReadOptions
@@ -163,25 +164,22 @@ def supply_logs(sources: Sequence[str], form: LogForm, gravity: Gravity) -> Supp
     names, size = file_names(files), max(1, min(TOGETHER, len(files) // BLOCKS))
     if len(files) >= MANY:
         form = replace(form, options=replace(form.options, many=True))
-    starts = range(0, len(files), size)
 
     def blocks(done: frozenset[int]) -> Iterator[tuple[int, Block]]:
-        for at, start in enumerate(starts):
-            own = slice(start, start + size)
-            if at not in done:
-                yield (
-                    at,
-                    LogsBlock(
-                        len(files[own]),
-                        known(files[own]),
-                        sources=tuple(files[own]),
-                        names=tuple(names[own]),
-                        form=form,
-                        gravity=gravity,
-                        alone=len(files) == 1,
-                    ),
-                )
+        for at, own in stretches(len(files), size, done):
+            yield (
+                at,
+                LogsBlock(
+                    len(files[own]),
+                    known(files[own]),
+                    sources=tuple(files[own]),
+                    names=tuple(names[own]),
+                    form=form,
+                    gravity=gravity,
+                    alone=len(files) == 1,
+                ),
+            )
 
     identity = [[form], *([source, *state_of(source)] for source in files)]
     name = files[0] if len(files) == 1 else f"{len(files):,} logs"
-    return Supply(name, len(files), len(starts), identity, (), blocks, "-" in files)
+    return Supply(name, len(files), -(-len(files) // size), identity, (), blocks, "-" in files)

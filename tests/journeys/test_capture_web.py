@@ -15,7 +15,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 
-import chromium
 import pytest
 from hand_held import PLANNED, Device, hand, held, text_of
 from test_site import AXE, serious
@@ -136,15 +135,6 @@ def on_a_terminal(start, tmp_path, data):
     assert program.wait() == 0
     assert shown.count(b"\a") == 12
     return (tmp_path / "terminal.csv").read_bytes()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[chromium.Browser]:
-    path = chromium.browser()
-    if path is None:
-        pytest.skip("needs chromium and chromedriver")
-    with chromium.session(path) as session:
-        yield session
 
 
 def wait_for(browser, script, what):

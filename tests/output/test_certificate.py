@@ -9,7 +9,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 
-import chromium
 import numpy as np
 import pytest
 from simulated import MEMS, noise, readings
@@ -209,15 +208,6 @@ def test_the_same_result_gives_the_same_page():
 
 
 # Printed by a browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = chromium.browser()
-    if path is None:
-        pytest.skip("no chromium and chromedriver here: apt-get install chromium chromium-driver")
-    with chromium.session(path) as found:
-        yield found
 
 
 CUT = """

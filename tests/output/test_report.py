@@ -11,7 +11,6 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-import chromium
 import numpy as np
 import pytest
 from simulated import MEMS, noise, readings
@@ -318,15 +317,6 @@ def test_a_fleet_has_a_row_and_a_mark_for_every_sensor():
 
 
 # In a browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    path = chromium.browser()
-    if path is None:
-        pytest.skip("no chromium and chromedriver here: apt-get install chromium chromium-driver")
-    with chromium.session(path) as found:
-        yield found
 
 
 BOXES = """
